@@ -1,0 +1,1 @@
+"""Commands and pipelines: straight-line composition of what `recon` offers."""

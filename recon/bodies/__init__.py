@@ -1,0 +1,1 @@
+"""Parametric bodies behind one 24-joint rig."""

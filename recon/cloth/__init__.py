@@ -1,0 +1,1 @@
+"""Cloth physics: energies, contact, simulation, minimisation."""

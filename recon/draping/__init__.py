@@ -1,0 +1,1 @@
+"""Drapers: a rest-pose garment onto a posed body."""

@@ -1,0 +1,1 @@
+"""Garment decoders, sewing patterns and their latent spaces."""

@@ -1,0 +1,1 @@
+"""A photo into pose, person mask and garment masks."""

@@ -1,0 +1,1 @@
+"""The only room that imports mitsuba and drjit: label images and pictures."""
