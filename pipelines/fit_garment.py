@@ -1,0 +1,207 @@
+"""Stage per garment, outermost first: retrieval over the learned codes, then code, pose and camera descend together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipelines.evidence import Level, level
+from pipelines.fit_body import BodyFit, evidence_loss, to_body, to_camera
+from recon.cloth.contact import BodyContact
+from recon.descend import Descent, descend
+from recon.garments.latents import mahalanobis
+from recon.losses import chamfer_pull, depth_penalty, hard_iou, soft_iou_loss
+from recon.types import Camera, Garment, Photo, PosedBody
+
+
+@dataclass(frozen=True)
+class GarmentFit:
+    """Settings of one garment's stage; weights are unitless."""
+
+    levels: tuple[tuple[int, int], ...] = ((112, 35), (224, 30))
+    """(pixels on the longer side, most steps) from coarse to fine."""
+    resolution: int = 96
+    """Decoding resolution while the code descends."""
+    final_resolution: int = 128
+    """Decoding resolution of the garment that the stage ends with."""
+    retrieval_resolution: int = 48
+    """Decoding resolution of the codes that retrieval compares."""
+    retrieval_pixels: int = 96
+    """Longer side of retrieval's silhouettes."""
+    starts: int = 2
+    """How many of the best retrieved codes get a first, coarse descent; the best goes on."""
+    latent_rate: float = 0.06
+    """Step size of the code in standard deviations of the learned codes."""
+    mahalanobis: float = 0.004
+    """Weight of the squared Mahalanobis distance from the mean code, per dimension."""
+    pull: float = 2.0
+    """Weight of the distance-field pull, faded out as the overlap grows."""
+    contact: float = 0.3
+    """Weight of missing clearance between garment and body."""
+    clearance: float = 0.004
+    """Wanted clearance [m]."""
+    anchor: float = 0.5
+    """Weight that keeps body and camera near what the body stage found (unit: 0.1 rad, 0.02 m, 0.1 log, 0.5 shape)."""
+    outer: float = 0.5
+    """Weight of each outer layer's overlap, relative to this garment's."""
+    descent: Descent = field(default_factory=lambda: Descent(patience=12))
+    """Shared settings of the levels; ``steps`` is taken from ``levels``."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """One fitted garment."""
+
+    name: str
+    garment: Garment
+    """Rest pose, welded."""
+
+
+@dataclass(frozen=True)
+class Models:
+    """Everything learned or measured that the stages use."""
+
+    body: object
+    draper: object
+    decoders: dict[str, object]
+    """Garment name -> decoder of its kind."""
+    variants: dict[str, tuple[str, ...]]
+    """Garment name -> variants of the kind that the name allows."""
+    renderer_of: Callable
+    """(faces, labels, n_vertices) -> label renderer."""
+
+
+BODY_SIZES = {"shape": 0.01, "pose": 0.006, "translation": 0.003, "log_focal": 0.002}
+"""Step sizes of body and camera while a code descends: they only settle."""
+ANCHOR_UNITS = {"shape": 0.5, "pose": 0.1, "translation": 0.02, "log_focal": 0.1}
+
+
+def photo_size(photo: Photo) -> tuple[int, int]:
+    """(height, width) of the photo in pixels."""
+    return photo.rgb.shape[0], photo.rgb.shape[1]
+
+
+def allowed_codes(decoder, variants: tuple[str, ...]) -> Tensor:
+    """Indices of the learned codes whose variant the garment's name allows (all where none is marked)."""
+    at = [i for i, v in enumerate(decoder.variants) if v in variants]
+    return torch.tensor(at or list(range(len(decoder.codes))))
+
+
+def silhouette(pixels: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Tensor:
+    """(h, w) bool: the union of projected triangles, without occlusion; (V, 2) pixels, (F, 3) faces."""
+    image = np.zeros(size, np.uint8)
+    corners = np.round(pixels[faces] * 16).astype(np.int32)
+    for triangle in corners:
+        cv2.fillConvexPoly(image, triangle, 1, shift=4)
+    return torch.from_numpy(image) > 0
+
+
+def retrieve(name: str, values: dict[str, Tensor], photo: Photo, models: Models, settings: GarmentFit, tick=None) -> Tensor:
+    """Codes by the overlap of their draped silhouettes with the mask, best first.
+
+    Pixels under an outer garment's mask count neither for nor against, like hair and hands.
+
+    Returns:
+        (n,) indices into the decoder's codes, best first.
+    """
+    at = level(photo, settings.retrieval_pixels)
+    mine = at.names.index(name)
+    hidden = at.targets[:mine].sum(0).clamp(0, 1)
+    weight = at.weight * (1 - hidden)
+    camera = at.camera(to_camera(values, photo_size(photo)))
+    decoder = models.decoders[name]
+    indices = allowed_codes(decoder, models.variants[name])
+    scores = torch.zeros(len(indices))
+    with torch.no_grad():
+        posed = models.body.pose(to_body(values))
+        for k, index in enumerate(indices):
+            garment = decoder.decode(decoder.codes[index], settings.retrieval_resolution)
+            draped = models.draper.drape(garment, posed).vertices[0]
+            pixels = camera.project(draped).numpy()
+            drawn = silhouette(pixels, garment.mesh.faces.numpy(), at.size)
+            scores[k] = hard_iou(drawn[None].float(), at.targets[mine][None], weight)[0]
+            if tick:
+                tick(k, float(scores[k]))
+    return indices[scores.argsort(descending=True)]
+
+
+def scene_images(
+    posed: PosedBody, layers: list[tuple[Tensor, Tensor]], camera: Camera, size: tuple[int, int], models: Models
+) -> Tensor:
+    """(L, h, w) visible coverage of the layers ((V, 3) vertices, (F, 3) faces) over a body that only hides."""
+    faces = [f for _, f in layers] + [models.body.faces]
+    labels = [*range(len(layers)), -1]
+    vertices = [v for v, _ in layers] + [posed.mesh.vertices[0]]
+    renderer = models.renderer_of(faces, labels, [len(v) for v in vertices])
+    return renderer(vertices, camera, size)
+
+
+def anchor_loss(values: dict[str, Tensor], anchors: dict[str, Tensor]) -> Tensor:
+    """Squared distance of body and camera from where the body stage left them, in ANCHOR_UNITS."""
+    return sum(((values[k] - anchors[k]) / u).square().mean() for k, u in ANCHOR_UNITS.items())
+
+
+class GarmentLoss:
+    """The loss of one garment's descent at one level (ISP Eq. 11, 18-23; DrapeNet Eq. 12)."""
+
+    def __init__(self, name, outer: list[Layer], anchors, photo: Photo, models: Models, settings: GarmentFit, long_side: int):
+        self.outer, self.anchors, self.photo, self.models, self.settings = outer, anchors, photo, models, settings
+        self.decoder = models.decoders[name]
+        self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
+        on = torch.nonzero(self.at.targets[-1] > 0.5)
+        chosen = torch.linspace(0, max(len(on) - 1, 0), min(len(on), 400)).long()
+        self.targets = on[chosen].flip(1).to(torch.float32) + 0.5
+
+    def __call__(self, values: dict[str, Tensor]) -> Tensor:
+        s, models = self.settings, self.models
+        posed = models.body.pose(to_body(values))
+        camera = self.at.camera(to_camera(values, photo_size(self.photo)))
+        garment = self.decoder.decode(values["latent"], s.resolution)
+        mine = models.draper.drape(garment, posed).vertices[0]
+        layers = [(models.draper.drape(o.garment, posed).vertices[0], o.garment.mesh.faces) for o in self.outer]
+        image = scene_images(posed, [*layers, (mine, garment.mesh.faces)], camera, self.at.size, models)
+        overlap = soft_iou_loss(image, self.at.targets, self.at.weight)
+        weights = torch.tensor([s.outer] * len(self.outer) + [1.0])
+        gap = BodyContact(posed.mesh.vertices[0], models.body.faces).signed_distance(mine)
+        loss = (weights * overlap).sum()
+        loss = loss + s.pull * overlap[-1].detach() ** 2 * chamfer_pull(camera.project(mine), self.at.fields[-1], self.targets)
+        loss = loss + s.contact * depth_penalty(gap, s.clearance) / 10
+        loss = loss + s.mahalanobis * mahalanobis(values["latent"], self.decoder.codes)
+        loss = loss + s.anchor * anchor_loss(values, self.anchors) / 10
+        return loss + 0.1 * evidence_loss(values, posed, models.body, self.photo, BodyFit())
+
+
+def fit_garment(
+    name: str, values: dict[str, Tensor], outer: list[Layer], photo: Photo, models: Models, settings: GarmentFit, tick=None
+) -> tuple[dict[str, Tensor], Layer]:
+    """Find the code of one garment; body and camera settle with it, outer layers stay as they are and stay rendered.
+
+    Args:
+        name: the garment, a key of ``photo.garments``.
+        values: body and camera as ``fit_body`` returns them.
+        outer: the layers outside, outermost first.
+
+    Returns:
+        The settled body and camera, and the layer.
+    """
+    decoder = models.decoders[name]
+    scale = decoder.codes.std(0).mean().item()
+    sizes = {**BODY_SIZES, "latent": settings.latent_rate * scale}
+    anchors = {k: values[k] for k in ANCHOR_UNITS}
+    starts = retrieve(name, values, photo, models, settings, tick)[: settings.starts]
+    best = None
+    for number, (long_side, steps) in enumerate(settings.levels):
+        loss = GarmentLoss(name, outer, anchors, photo, models, settings, long_side)
+        plan = Descent(**{**vars(settings.descent), "steps": steps, "rate": 0.5**number})
+        tries = [{**values, "latent": decoder.codes[i]} for i in starts] if best is None else [best.values]
+        ends = [descend(t, sizes, loss, plan, tick) for t in tries]
+        best = min(ends, key=lambda e: e.loss)
+    found = {k: best.values[k] for k in ANCHOR_UNITS}
+    with torch.no_grad():
+        garment = decoder.decode(best.values["latent"], settings.final_resolution)
+    return found, Layer(name, garment)
