@@ -1,0 +1,142 @@
+"""From one photo to simulation-ready garments: perceive, fit the body, fit each garment outer to inner, refine, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pipelines.fit_body import BodyFit, fit_body
+from pipelines.fit_garment import GarmentFit, Layer, Models, fit_garment
+from pipelines.refine import Refinement, refine
+from pipelines.results import FitResult, write_results
+from pipelines.run import Run
+from recon.files.state import file_digest
+from recon.types import Mesh, Photo, UserError, to_device
+
+Say = Callable[[str, str, float], None]
+
+
+@dataclass(frozen=True)
+class PhotoFit:
+    """Settings of ``recon photo``."""
+
+    photo: Path
+    """The photo: one person, whole body at best."""
+    garments: tuple[str, ...] = ("top", "trousers")
+    """What the person wears, e.g. jacket,top,trousers; the order does not matter."""
+    out: Path = Path("out/photo")
+    """Folder for the results; a run that was interrupted goes on from there."""
+    masks: tuple[str, ...] = ()
+    """Your own masks: one label PNG (with ``labels``), or NAME=FILE with one binary PNG per garment."""
+    labels: str = ""
+    """Meaning of the label PNG's values, e.g. 1=top,2=trousers."""
+    person: int | None = None
+    """Which person, counted from the largest (1); None takes the largest and says so."""
+    body: str = "anny"
+    """Body model: anny (embedded) or smpl, smplh, smplx with ``body_file``."""
+    body_file: Path | None = None
+    """Your own SMPL, SMPL-H or SMPL-X file."""
+    weights: Path | None = None
+    """Folder with decoder weights; None takes the shipped ones."""
+    seed: int = 0
+    """Seed of everything random."""
+    device: str = "cpu"
+    """cpu or cuda."""
+    body_fit: BodyFit = field(default_factory=BodyFit)
+    """Settings of the body stage."""
+    garment_fit: GarmentFit = field(default_factory=GarmentFit)
+    """Settings of each garment's stage."""
+    refinement: Refinement = field(default_factory=Refinement)
+    """Settings of the refine stage."""
+
+
+def load_models(garments: tuple[str, ...], config: PhotoFit) -> Models:
+    """Body, draper, decoders and renderer for the named garments; UserError for unknown names or missing weights."""
+    from recon.bodies import load_body
+    from recon.draping.skinning import SkinningDraper
+    from recon.garments import NAMES, load_decoder
+    from recon.render.labels import LabelRenderer
+
+    unknown = [name for name in garments if name not in NAMES]
+    if unknown:
+        raise UserError(f"--garments: found {', '.join(unknown)}; wanted some of {', '.join(NAMES)}")
+    body = load_body(config.body, config.body_file, config.device)
+    kinds = {name: NAMES[name][0] for name in garments}
+    decoders = {kind: load_decoder(kind, device=config.device, folder=config.weights) for kind in set(kinds.values())}
+    return Models(
+        body=body,
+        draper=SkinningDraper(body),
+        decoders={name: decoders[kind] for name, kind in kinds.items()},
+        variants={name: tuple(NAMES[name][1]) for name in garments},
+        renderer_of=LabelRenderer,
+    )
+
+
+def fit_photo(config: PhotoFit, say: Say | None = None, tick=None) -> FitResult:
+    """Fit the garments of one photo and write the results to ``config.out``.
+
+    Args:
+        config: see :class:`PhotoFit`.
+        say: hears (stage, event, seconds) of every stage's start and end.
+        tick: hears (step, loss) inside stages.
+
+    Raises:
+        UserError: one line about what is wrong with photo, masks, names, weights or the output folder.
+    """
+    from recon.files.masks import read_masks
+    from recon.files.photos import read_photo
+    from recon.perceive import perceive
+
+    torch.manual_seed(config.seed)
+    rgb = read_photo(config.photo)
+    masks = read_masks(config.masks, config.labels, config.garments, tuple(rgb.shape[:2])) if config.masks else None
+    models = load_models(config.garments, config)
+    run = open_run(config, masks, say)
+    photo = run.stage("perceive", perceive, rgb, config.garments, config.person, masks)
+    fitted = fit_evidence(to_device(photo, torch.device(config.device)), models, config, run, tick)
+    return write_results(config, photo, models, fitted, run.seconds)
+
+
+def open_run(config: PhotoFit, masks: dict[str, Tensor] | None, say: Say | None) -> Run:
+    """The run's folder: its identity is the photo and the garments; masks, person, body and weights are evidence."""
+    from recon.files.weights import manifest_digest
+
+    identity = {"photo": file_digest(config.photo), "garments": sorted(config.garments)}
+    evidence = {
+        "masks": {k: int(v.sum()) for k, v in masks.items()} if masks else {},
+        "mask_files": [file_digest(m.partition("=")[2] or m) for m in config.masks],
+        "labels": config.labels,
+        "person": config.person,
+        "body": [config.body, file_digest(config.body_file) if config.body_file else ""],
+        "weights": manifest_digest(config.weights),
+        "seed": config.seed,
+        "device": config.device,
+    }
+    return Run(config.out, identity, evidence, config.device, *([say] if say else []))
+
+
+def fit_evidence(
+    photo: Photo, models: Models, config: PhotoFit, run: Run, tick=None
+) -> tuple[dict[str, Tensor], list[Layer], dict[str, Mesh]]:
+    """The fit itself: body and camera, then garments from outer to inner, then all of them under physics.
+
+    Returns:
+        Body and camera parameters; the layers at rest, outermost first; name -> refined posed mesh.
+    """
+    values = run.stage("body", lambda s: fit_body(photo, models.body, models.renderer_of, s, tick), config=config.body_fit)
+    layers: list[Layer] = []
+    for name in photo.garments:
+        values, layer = run.stage(
+            name,
+            lambda s, name=name, values=values: fit_garment(name, values, layers, photo, models, s, tick),
+            config=config.garment_fit,
+        )
+        layers.append(layer)
+    meshes = run.stage(
+        "refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement
+    )
+    return values, layers, meshes

@@ -1,0 +1,146 @@
+"""The results of a fit: figures, meshes, patterns, pictures, ``result.json`` and the report, written to the run's folder."""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pipelines.evidence import level
+from pipelines.fit_body import to_body, to_camera
+from pipelines.fit_garment import Layer, Models, photo_size
+from pipelines.measure import body_overlap, geometry, overlaps
+from recon.cloth.contact import BodyContact
+from recon.files.atomic import write_whole
+from recon.files.meshes import write_glb, write_obj
+from recon.files.patterns import write_svg
+from recon.types import BodyPose, Camera, Mesh, Photo
+
+SCHEMA = 1
+COLOURS = {
+    "body": (0.80, 0.66, 0.57),
+    "top": (0.36, 0.53, 0.76),
+    "jacket": (0.33, 0.56, 0.45),
+    "trousers": (0.42, 0.42, 0.50),
+    "skirt": (0.78, 0.42, 0.52),
+    "dress": (0.72, 0.45, 0.70),
+}
+"""sRGB colours of body and garments in scenes and pictures; other names share a neutral one."""
+OTHER = (0.82, 0.60, 0.35)
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """What ``fit_photo`` found; the same as the files in ``folder``, as tensors. World: feet at y = 0."""
+
+    folder: Path
+    figures: dict
+    """The content of ``result.json``."""
+    photo: Photo
+    camera: Camera
+    body_pose: BodyPose
+    body: Mesh
+    """(V, 3) posed body."""
+    layers: tuple[Layer, ...]
+    """Rest-pose garments with their panels, outermost first."""
+    garments: dict[str, Mesh]
+    """Name -> refined mesh (V, 3), welded and open, in the pose of the photo."""
+
+
+def colour_of(name: str) -> tuple[float, float, float]:
+    """The colour of a body or garment in scenes and pictures."""
+    aliases = {"tshirt": "top", "shirt": "top", "tank": "top", "shorts": "trousers"}
+    return COLOURS.get(aliases.get(name, name), OTHER)
+
+
+def grounded(body: Mesh, meshes: dict[str, Mesh], camera: Camera) -> tuple[Mesh, dict[str, Mesh], Camera, Tensor]:
+    """Move the world so that the body's lowest point is at y = 0 below x = z = 0; the camera moves with it.
+
+    Returns:
+        Body, garments, camera, and the (3,) shift that was added to every vertex [m].
+    """
+    v = body.vertices
+    middle = (v.min(0).values + v.max(0).values) / 2
+    shift = -torch.stack([middle[0], v[:, 1].min(), middle[2]])
+    moved = {k: m.with_vertices(m.vertices + shift) for k, m in meshes.items()}
+    return body.with_vertices(v + shift), moved, replace(camera, t=camera.t - camera.R @ shift), shift
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the result depends on."""
+    found = {"python": platform.python_version()}
+    for name in ("garment-recon", "torch", "mitsuba", "drjit", "warp-lang", "numpy"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def measure_all(values: dict[str, Tensor], layers: list[Layer], meshes: dict[str, Mesh], photo: Photo, models: Models) -> dict:
+    """Figures per garment and of the whole: keys ``garments`` and ``body`` of ``result.json``."""
+    at = level(photo, 512).pick(tuple(layer.name for layer in layers))
+    with torch.no_grad():
+        posed = models.body.pose(to_body(values))
+        coded = {n: Mesh(models.draper.drape(g, posed).vertices[0], g.mesh.faces) for n, g in ((x.name, x.garment) for x in layers)}
+    contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
+    refined, by_code = overlaps(meshes, values, photo, models, at), overlaps(coded, values, photo, models, at)
+    garments = {}
+    for layer in layers:
+        n = layer.name
+        garments[n] = {
+            "kind": layer.garment.kind,
+            "iou": refined[n],
+            "iou_code_only": by_code[n],
+            **geometry(layer, meshes[n], contact),
+            "mask_confidence": photo.confidence.get(n),
+        }
+    return {"garments": garments, "body": {"iou": body_overlap(meshes, values, photo, models, at)}}
+
+
+def write_results(
+    config, photo: Photo, models: Models, fitted: tuple[dict[str, Tensor], list[Layer], dict[str, Mesh]], seconds: dict
+) -> FitResult:
+    """Measure, write everything but ``result.json``, then ``result.json`` last (its presence says that all is there)."""
+    from pipelines.report import write_pictures, write_report
+
+    begin = time.perf_counter()
+    values, layers, meshes = fitted
+    out = Path(config.out)
+    with torch.no_grad():
+        posed = models.body.pose(to_body(values))
+    camera = to_camera(values, photo_size(photo))
+    body, moved, camera, shift = grounded(Mesh(posed.mesh.vertices[0], models.body.faces), meshes, camera)
+    place = replace(to_body(values), translation=values["translation"] + shift)
+    figures = {
+        "schema": SCHEMA,
+        "seed": config.seed,
+        "device": config.device,
+        "versions": versions(),
+        **measure_all(values, layers, meshes, photo, models),
+        "camera": {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(), "size": list(camera.size)},
+        "body_model": {"name": config.body, "shape": place.shape[0].tolist(), "pose": place.pose[0].tolist(), "translation": place.translation[0].tolist()},
+        "confidence": photo.confidence,
+        "notes": list(photo.notes),
+    }
+    write_obj(body, out / "body.obj", "body")
+    parts = {"body": (body, colour_of("body"))}
+    for layer in layers:
+        garment = replace(layer.garment, mesh=moved[layer.name])
+        write_obj(garment, out / f"{layer.name}.obj", layer.name)
+        write_svg(layer.garment, out / "patterns" / f"{layer.name}.svg", layer.name)
+        parts[layer.name] = (garment, colour_of(layer.name))
+    write_glb(parts, out / "scene.glb")
+    result = FitResult(out, figures, photo, camera, place, body, tuple(layers), moved)
+    pictures = write_pictures(result)
+    took = time.perf_counter() - begin
+    figures["seconds"] = {**seconds, "export": took, "total": sum(seconds.values()) + took}
+    write_report(result, pictures, config)
+    write_whole(out / "result.json", json.dumps(figures, indent=1) + "\n")
+    return result
