@@ -1,0 +1,137 @@
+"""The photo pipeline measured: the bundled photos, photos beside the repository, and outfits of known truth.
+
+    python benchmarks/photo.py                 # everything; JSON to docs/results/photo.json, tables to docs/results/photo.md
+    python benchmarks/photo.py --only demo     # one job; names are those of JOBS, or 'truth'
+
+Each photo runs as a user would run it (``recon photo`` in a process of its own), so that its peak memory and time are its
+own. Outfits of known truth are test garments that no decoder has seen, skinned to unseen bodies and poses, rendered to
+masks; landmarks are the body's own points with 1 % noise. Perception is not part of those.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = Path(os.environ.get("GARMENT_RECON_SHARED", ROOT.parent / "shared"))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One photo and what the person wears."""
+
+    photo: Path
+    garments: str
+
+
+BUNDLED = ROOT / "examples" / "photos"
+JOBS = {
+    "demo": Job(BUNDLED / "man-hoodie-trousers.jpg", "top,trousers"),
+    "open-jacket": Job(BUNDLED / "woman-open-jacket-jeans.jpg", "jacket,top,trousers"),
+    "sweater": Job(BUNDLED / "man-sweater-jeans.jpg", "top,trousers"),
+    "blazer": Job(BUNDLED / "woman-open-blazer-trousers.jpg", "jacket,top,trousers"),
+    "shorts": Job(BUNDLED / "man-tshirt-shorts-small.png", "tshirt,shorts"),
+    "ryota": Job(SHARED / "photos" / "pifu_ryota.png", "top,trousers"),
+    "dress": Job(SHARED / "photos" / "human_ai-body.jpg", "dress"),
+    "skirt": Job(SHARED / "photos" / "human_person-linda.jpg", "top,skirt"),
+    "suit": Job(SHARED / "photos" / "human_person-vlado1.jpg", "jacket,trousers"),
+}
+
+
+def run_photo(name: str, job: Job, out: Path) -> dict:
+    """Run ``recon photo`` afresh; its figures, wall seconds and peak memory, or the line it ended with."""
+    folder = out / name
+    shutil.rmtree(folder, ignore_errors=True)
+    command = [sys.executable, "-m", "pipelines.cli", "photo", str(job.photo), "--garments", job.garments, "--out", str(folder)]
+    begin = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as log:
+        child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=log)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        log.seek(0)
+        said = log.read()
+    row = {"photo": job.photo.name, "wanted": job.garments, "wall_seconds": round(time.perf_counter() - begin, 1)}
+    row["peak_memory_gb"] = round(usage.ru_maxrss / 2**20, 2)
+    if child.returncode:
+        return {**row, "error": said.strip().splitlines()[-1] if said.strip() else f"exit code {child.returncode}"}
+    figures = json.loads((folder / "result.json").read_text())
+    return {**row, **{k: figures[k] for k in ("garments", "body", "seconds", "confidence", "notes")}}
+
+
+def keep_picture(name: str, out: Path) -> None:
+    """Copy the overview picture of one result to docs/results."""
+    source = out / name / "overview.jpg"
+    if source.exists():
+        shutil.copyfile(source, ROOT / "docs" / "results" / f"photo-{name}.jpg")
+
+
+def table(rows: dict[str, dict]) -> list[str]:
+    """Markdown rows, one per garment."""
+    head = "| photo | garment | IoU | IoU, code only | inside body (v/f) | self-intersections | stretch p95 | total s | peak GB |"
+    lines = [head, "|" + "---|" * 9]
+    for name, row in rows.items():
+        if "error" in row:
+            lines.append(f"| {name} | {row['wanted']} | {row['error']} | | | | | {row['wall_seconds']} | {row['peak_memory_gb']} |")
+            continue
+        for garment, g in row["garments"].items():
+            inside = f"{g['penetrating_vertices']}/{g['penetrating_faces']}"
+            lines.append(
+                f"| {name} | {garment} | {g['iou']:.3f} | {g['iou_code_only']:.3f} | {inside} | {g['self_intersections']} "
+                f"| {g['stretch_p95']:.3f} | {row['seconds']['total']:.0f} | {row['peak_memory_gb']} |"
+            )
+    return lines
+
+
+def write_page(found: dict) -> None:
+    """docs/results/photo.md from the JSON."""
+    lines = ["# The photo pipeline, measured", "", f"`python benchmarks/photo.py` on {found['machine']}, {found['cores']} cores.", ""]
+    lines += ["IoU counts pixels outside hair, hands and things held in front, against the mask that perception found.", ""]
+    lines += table(found["photos"])
+    for name in found["photos"]:
+        if (ROOT / "docs" / "results" / f"photo-{name}.jpg").exists():
+            lines += ["", f"## {name}", "", f"![{name}](photo-{name}.jpg)"]
+    if "truth" in found:
+        lines += ["", "## Outfits of known truth", "", "| kind | cases | IoU, median | Chamfer to truth, median mm |", "|---|---|---|---|"]
+        lines += [f"| {k} | {v['cases']} | {v['iou']:.3f} | {v['chamfer_mm']:.1f} |" for k, v in found["truth"]["kinds"].items()]
+    (ROOT / "docs" / "results" / "photo.md").write_text("\n".join(lines) + "\n")
+
+
+def main() -> None:
+    """Run the jobs and write JSON, tables and pictures."""
+    import platform
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="*", default=[*JOBS, "truth"])
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "benchmark")
+    parser.add_argument("--cases", type=int, default=10, help="outfits of known truth")
+    args = parser.parse_args()
+    store = ROOT / "docs" / "results" / "photo.json"
+    found = json.loads(store.read_text()) if store.exists() else {"photos": {}}
+    found |= {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "date": time.strftime("%Y-%m-%d")}
+    for name in args.only:
+        if name == "truth":
+            from truth import run_truth
+
+            found["truth"] = run_truth(args.cases, args.out)
+        elif not JOBS[name].photo.exists():
+            print(f"{name}: {JOBS[name].photo.name} is not here, skipped")
+            continue
+        else:
+            found["photos"][name] = run_photo(name, JOBS[name], args.out)
+            keep_picture(name, args.out)
+        store.write_text(json.dumps(found, indent=1) + "\n")
+        write_page(found)
+    print(json.dumps(found["photos"] | {"truth": found.get("truth")}))
+
+
+if __name__ == "__main__":
+    main()
