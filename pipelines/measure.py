@@ -9,7 +9,7 @@ from pipelines.evidence import Level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size, scene_images
 from recon.cloth.contact import BodyContact
-from recon.cloth.energies import Cloth, Fabric, principal_stretches
+from recon.cloth.energies import Cloth, stretch
 from recon.cloth.intersections import self_intersections
 from recon.losses import hard_iou
 from recon.types import Mesh, Photo
@@ -48,12 +48,12 @@ def geometry(layer: Layer, mesh: Mesh, contact: BodyContact) -> dict[str, float 
     with torch.no_grad():
         inside = contact.signed_distance(mesh.vertices) < 0
         centres = contact.signed_distance(mesh.vertices[mesh.faces].mean(1)) < 0
-        stretch = principal_stretches(Cloth.from_garment(layer.garment, Fabric()), mesh.vertices)[:, 0]
+        stretched = stretch(Cloth.from_garment(layer.garment), mesh.vertices)
     return {
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
         "penetrating_vertices": int(inside.sum()),
         "penetrating_faces": int(centres.sum()),
         "self_intersections": len(self_intersections(mesh.vertices, mesh.faces)),
-        "stretch_p95": float(stretch.quantile(0.95)),
+        "stretch_p95": float(stretched.quantile(0.95)),
     }

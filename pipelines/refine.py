@@ -16,7 +16,7 @@ from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size, scene_images
 from recon.cloth.contact import BodyContact
-from recon.cloth.energies import Cloth, Fabric, bending, gravity, stvk
+from recon.cloth.energies import GRAVITY, Cloth, bending, gravity, stvk
 from recon.cloth.smooth import SmoothCoordinates
 from recon.descend import Descent, descend
 from recon.losses import soft_iou_loss
@@ -78,16 +78,16 @@ def make_piece(layer: Layer, draped: Tensor, settings: Refinement) -> Piece:
     """Physics of one layer with its panels as the rest shape."""
     faces = layer.garment.mesh.faces
     smooth = SmoothCoordinates(faces, len(draped), settings.stiffness)
-    return Piece(layer, Cloth.from_garment(layer.garment, Fabric()), smooth, waist(layer), draped)
+    return Piece(layer, Cloth.from_garment(layer.garment), smooth, waist(layer), draped)
 
 
 def physics_loss(piece: Piece, x: Tensor, settings: Refinement) -> Tensor:
     """Strain, bending, gravity and the held waist of one layer, each per garment and unitless."""
-    fabric = Fabric()
-    unit = piece.cloth.area.sum() * fabric.thickness * (fabric.mu + 0.5 * fabric.lam) * 0.05**2
+    fabric = piece.cloth.fabric
+    unit = piece.cloth.areas.sum() * fabric.thickness * (fabric.lame_mu + 0.5 * fabric.lame_lambda) * 0.05**2
     loss = settings.strain * stvk(piece.cloth, x) / unit + settings.bend * bending(piece.cloth, x) / unit
-    mass = piece.cloth.mass.sum() * 9.81
-    loss = loss + settings.weight * gravity(piece.cloth, x - piece.start) / mass
+    fall = gravity(piece.cloth, x - piece.start) / (GRAVITY * piece.cloth.masses.sum())
+    loss = loss + settings.weight * fall
     if len(piece.held):
         drift = (x[piece.held] - piece.start[piece.held]) / 0.01
         loss = loss + settings.hold * drift.square().sum(1).mean()
