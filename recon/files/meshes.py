@@ -1,0 +1,156 @@
+"""Meshes on disk: OBJ with panel coordinates, GLB scenes, and reading what others wrote."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.files.atomic import write_whole
+from recon.types import Garment, Mesh, UserError
+
+Colour = tuple[float, float, float]
+
+_READABLE = ("obj", "ply", "stl", "off", "glb", "gltf")
+
+
+def finite_vertices(mesh: Mesh, name: str) -> np.ndarray:
+    """(V, 3) float64 vertices of one mesh; a ValueError where what is no place in space would be written."""
+    vertices = mesh.vertices.detach().cpu().double()
+    if vertices.ndim == 3 and vertices.shape[0] == 1:
+        vertices = vertices[0]
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"{name}: vertices are {tuple(vertices.shape)}; wanted (V, 3)")
+    bad = int((~torch.isfinite(vertices).all(dim=1)).sum())
+    if bad:
+        raise ValueError(f"{name}: {bad} of {len(vertices)} vertices are NaN or infinite; nothing was written")
+    faces = mesh.faces
+    if len(faces) and (int(faces.min()) < 0 or int(faces.max()) >= len(vertices)):
+        raise ValueError(f"{name}: faces name vertices outside 0..{len(vertices) - 1}; nothing was written")
+    return vertices.numpy()
+
+
+def write_obj(thing: Mesh | Garment, path: str | Path, name: str = "") -> None:
+    """Write one named object in metres, y up; vertices stay welded.
+
+    A garment's texture coordinates are its panel coordinates in metres, one per corner: the sewing pattern is the UV
+    map. ``name`` defaults to the file's stem. NaN, infinities and bad indices are a ValueError before anything is
+    written.
+    """
+    path = Path(path)
+    name = name or path.stem
+    mesh = thing.mesh if isinstance(thing, Garment) else thing
+    vertices = finite_vertices(mesh, name)
+    lines = [f"# {name}: metres, y up" + (", vt = panel coordinates in metres" if isinstance(thing, Garment) else "")]
+    lines.append(f"o {name}")
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
+    corners = (mesh.faces.cpu() + 1).tolist()
+    if isinstance(thing, Garment):
+        points = thing.panel_points.detach().cpu()
+        if not torch.isfinite(points).all():
+            raise ValueError(f"{name}: panel coordinates are NaN or infinite; nothing was written")
+        lines += [f"vt {u:.6f} {v:.6f}" for u, v in points.tolist()]
+        for (a, b, c), (i, j, k) in zip(corners, (thing.panel_faces.cpu() + 1).tolist(), strict=True):
+            lines.append(f"f {a}/{i} {b}/{j} {c}/{k}")
+    else:
+        lines += [f"f {a} {b} {c}" for a, b, c in corners]
+    write_whole(path, "\n".join(lines) + "\n")
+
+
+def write_glb(parts: Mapping[str, tuple[Mesh | Garment, Colour]], path: str | Path) -> None:
+    """Write a binary glTF scene: one named node per part, in its sRGB colour (each channel in [0, 1]).
+
+    Garments are open surfaces, hence double-sided; bodies are closed and are not.
+    """
+    import trimesh
+
+    scene = trimesh.Scene()
+    for name, (thing, colour) in parts.items():
+        garment = isinstance(thing, Garment)
+        mesh = thing.mesh if isinstance(thing, Garment) else thing
+        vertices, faces = finite_vertices(mesh, name), mesh.faces.cpu().numpy()
+        shape = trimesh.Trimesh(vertices, faces, vertex_normals=_normals(vertices, faces), process=False)
+        # glTF wants colour factors linear; people name colours in sRGB.
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
+        material = trimesh.visual.material.PBRMaterial(
+            name=name,
+            baseColorFactor=np.round([255 * c for c in (*linear, 1.0)]).astype(np.uint8),
+            metallicFactor=0.0,
+            roughnessFactor=0.9,
+            doubleSided=garment,
+        )
+        shape.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.add_geometry(shape, node_name=name, geom_name=name)
+    write_whole(path, trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) unit normals, area-weighted; up where no area meets a vertex (glTF allows no zero normals)."""
+    corners = vertices[faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], area)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 0, total / np.where(length > 0, length, 1.0), (0.0, 1.0, 0.0))
+
+
+def read_mesh(path: str | Path) -> Mesh:
+    """Read a triangle mesh: OBJ (welded as written), PLY, STL, OFF, GLB or glTF; polygons are cut into fans.
+
+    Objects of one file are joined. Vertices (V, 3) float32 as they stand in the file, faces (F, 3) long, on the CPU.
+    UserError: missing file, another format, unreadable, no triangles, NaN or infinite vertices, indices out of range.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    if not path.is_file():
+        raise UserError(f"{path}: no such file; wanted a mesh ({', '.join(_READABLE)})")
+    if kind not in _READABLE:
+        raise UserError(f"{path}: a .{kind} file; wanted a mesh ({', '.join(_READABLE)})")
+    try:
+        vertices, faces = _read_obj(path) if kind == "obj" else _read_with_trimesh(path, kind)
+    except UserError:
+        raise
+    except Exception as error:  # whatever a parser raises on a broken file is the file's fault
+        raise UserError(f"{path}: cannot be read as {kind} ({type(error).__name__}); wanted a mesh") from None
+    if len(faces) == 0:
+        raise UserError(f"{path}: {len(vertices)} vertices without a triangle; wanted a surface")
+    if not torch.isfinite(vertices).all():
+        raise UserError(f"{path}: has vertices that are NaN or infinite; wanted numbers in metres")
+    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        raise UserError(f"{path}: has faces that name missing vertices; wanted indices of its {len(vertices)} vertices")
+    return Mesh(vertices, faces)
+
+
+def _read_obj(path: Path) -> tuple[Tensor, Tensor]:
+    """Vertices and fan triangles of an OBJ file, vertices neither split at texture seams nor reordered."""
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for line in path.read_text(errors="replace").splitlines():
+        word, _, rest = line.strip().partition(" ")
+        if word == "v":
+            vertices.append([float(number) for number in rest.split()[:3]])
+        elif word == "f":
+            at = [int(corner.split("/")[0]) for corner in rest.split()]
+            at = [i - 1 if i > 0 else len(vertices) + i for i in at]
+            faces += [(at[0], at[i], at[i + 1]) for i in range(1, len(at) - 1)]
+    return torch.tensor(vertices, dtype=torch.float32).reshape(-1, 3), torch.tensor(faces, dtype=torch.long).reshape(
+        -1, 3
+    )
+
+
+def _read_with_trimesh(path: Path, kind: str) -> tuple[Tensor, Tensor]:
+    """The same through trimesh, every node of a scene in its place."""
+    import trimesh
+
+    loaded = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=kind, process=False).to_geometry()
+    if not isinstance(loaded, trimesh.Trimesh):
+        return torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long)
+    if kind == "stl":  # the one format in which triangles cannot share vertices
+        loaded.merge_vertices()
+    vertices = torch.as_tensor(np.array(loaded.vertices), dtype=torch.float32)
+    return vertices, torch.as_tensor(np.array(loaded.faces), dtype=torch.long)
