@@ -1,0 +1,321 @@
+"""Train the implicit sewing patterns of one garment kind (ISP §3.1, Eq. 2-5): ``recon train isp --kind top``.
+
+The pattern network, the surface map and a code per garment learn together. Garments know which panel point lies where in
+space, so that Eq. 4's Chamfer distance and normal consistency and Eq. 5's seam consistency are written by correspondence
+(exact, and much sharper than nearest neighbours): distances of points, of their differences along the panel (Sobolev), of
+normals, of borders and seams, and the gap between the two sides of a seam.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from pipelines.isp_samples import GRID, IspSamples, collect, frame
+from recon.files.weights import write_weights
+from recon.garments.isp import IspDecoder, Variant
+from recon.garments.isp_net import IspNets, IspShape
+from recon.types import Garment, UserError
+
+STEP = 3
+"""Grid points between the ends of a finite difference on the position maps."""
+
+
+@dataclass(frozen=True)
+class TrainIsp:
+    """Settings of one training."""
+
+    kind: str
+    """Garment kind: top, skirt, trousers or dress."""
+    data: Path | None = None
+    """Folder or file of the garment data set; the packaged one if not given."""
+    out: Path = Path("out/weights")
+    """Folder for the weights, their manifest, the log and the checkpoints."""
+    minutes: float = 20.0
+    """Training time [minutes], preparation and evaluation not counted."""
+    seed: int = 0
+    """Seed of initialisation and sampling."""
+    threads: int = 2
+    """CPU threads."""
+    garments: int = 0
+    """Train on the first so many garments only; 0 = all."""
+    batch: int = 16
+    """Garments per step."""
+    surface_points: int = 144
+    """Places per garment and step at which the surface map is compared (three points each, both panels)."""
+    border_points: int = 48
+    """Border points and seam points per garment and step."""
+    pattern_points: int = 448
+    """Signed distance samples per garment and step."""
+    rate: float = 2e-3
+    """Adam's learning rate of the networks at the start; decays along a cosine."""
+    code_rate: float = 2e-3
+    """The same for the codes."""
+    width: int = 256
+    """Units per layer."""
+    pattern_depth: int = 4
+    """Layers of I_Θ."""
+    surface_depth: int = 6
+    """Layers of A_Φ."""
+    code: int = 32
+    """Length of a latent code."""
+    evaluate: int = 20
+    """Held-out garments to evaluate on; 0 = none."""
+
+
+@dataclass
+class Progressing:
+    """What changes while training; saved in checkpoints."""
+
+    nets: IspNets
+    codes: torch.nn.Parameter
+    optimizer: torch.optim.Adam
+    step: int = 0
+    seconds: float = 0.0
+
+
+def train_isp(config: TrainIsp) -> Path:
+    """Train, evaluate on held-out garments and write weights with their card; returns the weights' file.
+
+    Interrupted, the next call with the same settings goes on from the last checkpoint (one a minute).
+
+    Raises:
+        UserError: no garments of this kind.
+    """
+    from recon.garments.dataset import load_garments  # not needed by those who bring their own garments
+
+    source = config.data if config.data is not None else config.kind
+    everything = load_garments(source, split="train")
+    garments = [g for g in everything if g.kind == config.kind][: config.garments or None]
+    if not garments:
+        raise UserError(f"{source}: no garments of kind {config.kind} to train on; make a data set first")
+    decoder, done = learn(garments, config)
+    metrics: dict[str, object] = {}
+    if config.evaluate:
+        from pipelines.eval_isp import evaluate
+
+        unseen = [g for g in load_garments(source, split="test") if g.kind == config.kind][: config.evaluate]
+        metrics = evaluate(decoder, garments[: config.evaluate], unseen)
+    return store(decoder, config, done, metrics)
+
+
+def learn(garments: list[Garment], config: TrainIsp) -> tuple[IspDecoder, Progressing]:
+    """The training itself, for garments of one kind in memory."""
+    torch.set_num_threads(config.threads)
+    config.out.mkdir(parents=True, exist_ok=True)
+    shape = replace(
+        frame(garments, config.code),
+        width=config.width,
+        pattern_depth=config.pattern_depth,
+        surface_depth=config.surface_depth,
+    )
+    samples = collect(garments, shape, np.random.default_rng(config.seed), STEP)
+    state = _start(samples, shape, config)
+    checkpoint = config.out / f"isp-{config.kind}.checkpoint"
+    _resume(state, checkpoint, config, len(garments))
+    generator = torch.Generator().manual_seed(config.seed + state.step)
+    _descend(state, samples, config, generator, checkpoint)
+    checkpoint.unlink(missing_ok=True)
+    variants = [Variant(g.variant, dict(getattr(g, "parameters", None) or {})) for g in garments]
+    return IspDecoder(state.nets, state.codes.detach().clone(), variants), state
+
+
+def _start(samples: IspSamples, shape: IspShape, config: TrainIsp) -> Progressing:
+    torch.manual_seed(config.seed)
+    nets = IspNets(shape)
+    codes = torch.nn.Parameter(first_codes(samples, shape.code))
+    groups = [
+        {"params": list(nets.parameters()), "lr": config.rate},
+        {"params": [codes], "lr": config.code_rate},
+    ]
+    return Progressing(nets, codes, torch.optim.Adam(groups, betas=(0.9, 0.99)))
+
+
+def first_codes(samples: IspSamples, size: int) -> Tensor:
+    """Starting codes (n, size): principal components of what the garments look like, so that neighbours start alike."""
+    coarse = samples.positions[:, ::8, ::8] * samples.covered[:, ::8, ::8, :, None]
+    features = torch.cat([coarse.flatten(1), samples.covered[:, ::8, ::8].flatten(1).float()], 1)
+    features = features - features.mean(0)
+    u, s, _ = torch.linalg.svd(features, full_matrices=False)
+    keep = min(size, len(samples) - 1) if len(samples) > 1 else 0
+    scores = u[:, :keep] * math.sqrt(len(samples)) * (s[:keep] / s[0]).sqrt()
+    return F.pad(scores, (0, size - keep)) + 0.01 * torch.randn(len(samples), size)
+
+
+def _descend(
+    state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator, checkpoint: Path
+) -> None:
+    """Adam along a cosine that follows the time spent."""
+    columns = TextColumn("isp {task.fields[kind]}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+    log = open(config.out / f"isp-{config.kind}.log.jsonl", "a")  # noqa: SIM115
+    budget, smooth, saved = config.minutes * 60, {}, state.seconds
+    with log, Progress(*columns) as progress:
+        bar = progress.add_task("train", total=budget, kind=config.kind, note="")
+        while state.seconds < budget:
+            begun = time.perf_counter()
+            rate = min(1.0, (state.step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * state.seconds / budget) + 2e-3)
+            for group, full in zip(state.optimizer.param_groups, (config.rate, config.code_rate), strict=True):
+                group["lr"] = full * rate
+            terms = take_step(state, samples, config, generator)
+            state.step += 1
+            state.seconds += time.perf_counter() - begun
+            smooth = {k: 0.97 * smooth.get(k, v) + 0.03 * v for k, v in terms.items()}
+            if state.step % 100 == 0:
+                log.write(json.dumps({"step": state.step, "seconds": round(state.seconds, 1), **smooth}) + "\n")
+                log.flush()
+                note = f"step {state.step}  surface {smooth['surface_mm']:.2f} mm  pattern {smooth['pattern_mm']:.2f} mm"
+                progress.update(bar, completed=state.seconds, note=note)
+            if state.seconds - saved > 60:
+                saved = state.seconds
+                _save(state, checkpoint, config, len(samples))
+
+
+def take_step(state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator) -> dict[str, float]:
+    """One step on a random batch; returns the terms in millimetres or natural units."""
+    garments = torch.randperm(len(samples), generator=generator)[: config.batch]
+    z = state.codes[garments]
+    surface, measured = surface_loss(state.nets, z, samples, garments, config, generator)
+    pattern, more = pattern_loss(state.nets, z, samples, garments, config.pattern_points, generator)
+    loss = surface + pattern + 1e-4 * z.square().sum(1).mean()
+    state.optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(state.nets.parameters(), 1.0)
+    if bool(torch.isfinite(loss)):
+        state.optimizer.step()
+    scale = state.nets.shape.half * 1e3
+    return {k: float(v) * (scale if k.endswith("_mm") else 1.0) for k, v in {**measured, **more}.items()}
+
+
+def pattern_loss(
+    nets: IspNets, z: Tensor, samples: IspSamples, garments: Tensor, count: int, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Eq. 2: signed distance (L1) and edge labels (cross entropy) of both panels."""
+    pick = torch.randint(samples.at.shape[1], (len(garments), count), generator=generator)
+    row = garments[:, None]
+    x, target, label = samples.at[row, pick], samples.distance[row, pick], samples.label[row, pick]
+    with torch.autocast(x.device.type, torch.bfloat16):
+        out = nets.pattern(x, z)
+    distance, logits = nets.split_pattern(out.float())
+    # Far from the border only the sign matters: errors there count less.
+    error = (distance - target).abs()
+    absolute = (error * (0.1 / target.abs().clamp_min(0.1))).mean()
+    entropy = F.cross_entropy(logits.flatten(0, 2), label.flatten())
+    near = target.abs() < 0.02
+    return 4 * absolute + 0.04 * entropy, {"pattern_mm": error[near].mean().detach(), "entropy": entropy.detach()}
+
+
+def surface_loss(
+    nets: IspNets, z: Tensor, samples: IspSamples, garments: Tensor, config: TrainIsp, generator: torch.Generator
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Eq. 4 and 5 by correspondence: points, differences, normals, borders, seams and seam gaps."""
+    n, b, m = len(garments), config.surface_points, config.border_points
+    row = garments[:, None]
+    corner = samples.cells[row, torch.randint(samples.cells.shape[1], (n, b), generator=generator)].long()
+    cells = (corner[:, :, None] + torch.tensor([[0, 0], [STEP, 0], [0, STEP]])).flatten(1, 2)
+    target = samples.positions[row, cells[..., 0], cells[..., 1]].view(n, b, 3, 2, 3)
+    mask = samples.covered[row, cells[..., 0], cells[..., 1]].view(n, b, 3, 2).float()
+    pick = torch.randint(samples.border_at.shape[2], (n, 3, m), generator=generator)
+    rim = torch.stack([samples.border_at[row, k, pick[:, k]] for k in (0, 1)], 1)
+    rim_3d = torch.stack([samples.border_3d[row, k, pick[:, k]] for k in (0, 1)], 1)
+    seam, seam_3d = samples.seam_at[row, pick[:, 2]], samples.seam_3d[row, pick[:, 2]]
+    x = torch.cat([cells * (2 / (GRID - 1)) - 1, rim.flatten(1, 2), seam.transpose(1, 2).flatten(1, 2)], 1)
+    with torch.autocast(x.device.type, torch.bfloat16):
+        out = nets.surface(x, z)
+    places = nets.lift(out, x)
+    found = places[:, : 3 * b].view(n, b, 3, 2, 3)
+    border = places[:, 3 * b : 3 * b + 2 * m].view(n, 2, m, 2, 3)
+    joint = places[:, 3 * b + 2 * m :].view(n, 2, m, 2, 3)
+    terms = _compare(found, target, mask)
+    terms["border"] = torch.stack([_length(border[:, k, :, k] - rim_3d[:, k]).mean() for k in (0, 1)]).mean()
+    sides = [joint[:, k, :, k] for k in (0, 1)]
+    terms["seam"] = torch.stack([_length(side - seam_3d).mean() for side in sides]).mean()
+    terms["gap"] = _length(sides[0] - sides[1]).mean()
+    weights = {"point": 1.0, "border": 0.5, "seam": 0.5, "gap": 0.5, "difference": 0.02, "normal": 0.01}
+    loss = sum(weights[k] * v for k, v in terms.items())
+    names = {"point": "surface_mm", "border": "border_mm", "gap": "gap_mm", "normal": "normal"}
+    return loss, {names[k]: v.detach() for k, v in terms.items() if k in names}
+
+
+def _length(v: Tensor) -> Tensor:
+    return (v.square().sum(-1) + 1e-9).sqrt()
+
+
+def _compare(found: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tensor]:
+    """Points, differences and normals of (n, B, 3, 2, 3) corner triples; mask (n, B, 3, 2)."""
+    whole = mask.amin(2)
+    point = (_length(found - target) * mask).sum() / mask.sum().clamp_min(1)
+    u, v = found[:, :, 1] - found[:, :, 0], found[:, :, 2] - found[:, :, 0]
+    tu, tv = target[:, :, 1] - target[:, :, 0], target[:, :, 2] - target[:, :, 0]
+    total = whole.sum().clamp_min(1)
+    off = ((u - tu).square().sum(-1) + (v - tv).square().sum(-1) + 1e-10).sqrt() / (STEP * 2 / (GRID - 1))
+    normal = F.normalize(torch.linalg.cross(u, v), dim=-1, eps=1e-9)
+    wanted = F.normalize(torch.linalg.cross(tu, tv), dim=-1, eps=1e-9)
+    turned = 1 - (normal * wanted).sum(-1)
+    return {"point": point, "difference": (off * whole).sum() / total, "normal": (turned * whole).sum() / total}
+
+
+def _save(state: Progressing, path: Path, config: TrainIsp, count: int) -> None:
+    beside = path.with_suffix(".tmp")
+    torch.save(
+        {
+            "nets": state.nets.state_dict(),
+            "codes": state.codes.detach(),
+            "optimizer": state.optimizer.state_dict(),
+            "step": state.step,
+            "seconds": state.seconds,
+            "settings": _settings(config, count),
+        },
+        beside,
+    )
+    beside.replace(path)
+
+
+def _resume(state: Progressing, path: Path, config: TrainIsp, count: int) -> None:
+    if not path.is_file():
+        return
+    try:
+        kept = torch.load(path, weights_only=True)
+    except Exception as error:
+        raise UserError(f"{path}: not a readable checkpoint; delete it to train from the start") from error
+    if kept["settings"] != _settings(config, count):
+        raise UserError(f"{path}: checkpoint of other settings; finish that training or delete it")
+    state.nets.load_state_dict(kept["nets"])
+    with torch.no_grad():
+        state.codes.copy_(kept["codes"])
+    state.optimizer.load_state_dict(kept["optimizer"])
+    state.step, state.seconds = kept["step"], kept["seconds"]
+
+
+def _settings(config: TrainIsp, count: int) -> str:
+    """What a checkpoint must agree with to go on from it."""
+    free = {"out", "minutes", "threads", "evaluate", "garments"}
+    return json.dumps({**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True)
+
+
+def store(decoder: IspDecoder, config: TrainIsp, done: Progressing, metrics: dict[str, object]) -> Path:
+    """Write ``isp-<kind>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
+    tensors = {"codes": decoder.codes, **decoder.nets.state_dict()}
+    card = {
+        "what": f"implicit sewing patterns, {config.kind} (ISP networks I_Θ and A_Φ and {len(decoder.codes)} codes)",
+        "shape": asdict(decoder.nets.shape),
+        "variants": decoder.variants,
+        "parameters": decoder.parameters,
+        "data": f"{len(decoder.codes)} generated garments of kind {config.kind}",
+        "seed": config.seed,
+        "steps": done.step,
+        "minutes": round(done.seconds / 60, 1),
+        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        "licence": "CC0-1.0",
+        "metrics": metrics,
+    }
+    return write_weights(f"isp-{config.kind}", tensors, card, config.out)

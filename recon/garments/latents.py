@@ -1,0 +1,76 @@
+"""What the learned codes say about new ones: mean, prior, sampling, retrieval and editing directions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class LatentPrior:
+    """A normal distribution around the learned codes (not around zero: learned codes sit on a shell)."""
+
+    mean: Tensor
+    """(z,)."""
+    factor: Tensor
+    """(z, z) lower Cholesky factor of the covariance."""
+
+    @staticmethod
+    def of(codes: Tensor, shrink: float = 0.1) -> LatentPrior:
+        """Fit to codes (n, z); the covariance is pulled by ``shrink`` towards an isotropic one, so that few codes suffice."""
+        mean = codes.mean(0)
+        away = (codes - mean).double()
+        covariance = away.T @ away / max(len(codes) - 1, 1)
+        level = covariance.diagonal().mean().clamp_min(1e-8)
+        covariance = (1 - shrink) * covariance + shrink * level * torch.eye(len(mean), dtype=torch.float64, device=codes.device)
+        return LatentPrior(mean, torch.linalg.cholesky(covariance).to(codes.dtype))
+
+    def energy(self, z: Tensor) -> Tensor:
+        """Squared Mahalanobis distance per dimension: (..., z) -> (...); about 1 for a typical garment."""
+        white = torch.linalg.solve_triangular(self.factor, (z - self.mean)[..., None], upper=False)
+        return white.squeeze(-1).square().mean(-1)
+
+    def sample(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, z) random codes."""
+        white = torch.randn(count, len(self.mean), generator=generator, dtype=self.mean.dtype)
+        return self.mean + white.to(self.mean.device) @ self.factor.T
+
+
+def spread(codes: Tensor, count: int, among: Tensor | None = None) -> Tensor:
+    """Indices of up to ``count`` codes that cover the learned ones (farthest points first from the most central one).
+
+    ``among`` (K,) restricts the choice. The first index is the code nearest to the mean of the choice.
+    """
+    choice = torch.arange(len(codes), device=codes.device) if among is None else among
+    points = codes[choice]
+    picked = [int((points - points.mean(0)).square().sum(1).argmin())]
+    distance = (points - points[picked[0]]).square().sum(1)
+    while len(picked) < min(count, len(choice)):
+        picked.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (points - points[picked[-1]]).square().sum(1))
+    return choice[picked]
+
+
+def of_variants(variants: Sequence[str], wanted: Sequence[str]) -> Tensor:
+    """(K,) indices of the codes whose variant is among ``wanted``; all codes if none is."""
+    found = [k for k, name in enumerate(variants) if name in wanted]
+    return torch.tensor(found or range(len(variants)), dtype=torch.long)
+
+
+def nearest(codes: Tensor, z: Tensor, count: int = 1) -> Tensor:
+    """(count,) indices of the learned codes closest to z (z,), nearest first."""
+    return (codes - z).square().sum(1).topk(min(count, len(codes)), largest=False).indices
+
+
+def editing_direction(codes: Tensor, values: Tensor, ridge: float = 1e-2) -> Tensor:
+    """The direction (z,) in code space along which a measure grows by one unit per unit step, the rest kept if possible.
+
+    values: (n,) the measure of each learned garment (a pattern parameter such as sleeve length [m]). The direction is the
+    change of the mean code with the measure: it stays among the learned codes, unlike the gradient of a regression.
+    """
+    x, y = codes - codes.mean(0), values - values.mean()
+    scale = y.square().mean()
+    return (x * y[:, None]).mean(0) / (scale * (1 + ridge)).clamp_min(1e-12)
