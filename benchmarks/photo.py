@@ -51,7 +51,17 @@ def run_photo(name: str, job: Job, out: Path) -> dict:
     """Run ``recon photo`` afresh; its figures, wall seconds and peak memory, or the line it ended with."""
     folder = out / name
     shutil.rmtree(folder, ignore_errors=True)
-    command = [sys.executable, "-m", "pipelines.cli", "photo", str(job.photo), "--garments", job.garments, "--out", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "pipelines.cli",
+        "photo",
+        str(job.photo),
+        "--garments",
+        job.garments,
+        "--out",
+        str(folder),
+    ]
     begin = time.perf_counter()
     with tempfile.TemporaryFile("w+") as log:
         child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=log)
@@ -80,7 +90,9 @@ def table(rows: dict[str, dict]) -> list[str]:
     lines = [head, "|" + "---|" * 9]
     for name, row in rows.items():
         if "error" in row:
-            lines.append(f"| {name} | {row['wanted']} | {row['error']} | | | | | {row['wall_seconds']} | {row['peak_memory_gb']} |")
+            lines.append(
+                f"| {name} | {row['wanted']} | {row['error']} | | | | | {row['wall_seconds']} | {row['peak_memory_gb']} |"
+            )
             continue
         for garment, g in row["garments"].items():
             inside = f"{g['penetrating_vertices']}/{g['penetrating_faces']}"
@@ -93,15 +105,32 @@ def table(rows: dict[str, dict]) -> list[str]:
 
 def write_page(found: dict) -> None:
     """docs/results/photo.md from the JSON."""
-    lines = ["# The photo pipeline, measured", "", f"`python benchmarks/photo.py` on {found['machine']}, {found['cores']} cores.", ""]
-    lines += ["IoU counts pixels outside hair, hands and things held in front, against the mask that perception found.", ""]
+    lines = [
+        "# The photo pipeline, measured",
+        "",
+        f"`python benchmarks/photo.py` on {found['machine']}, {found['cores']} cores.",
+        "",
+    ]
+    lines += [
+        "IoU counts pixels outside hair, hands and things held in front, against the mask that perception found.",
+        "",
+    ]
     lines += table(found["photos"])
     for name in found["photos"]:
         if (ROOT / "docs" / "results" / f"photo-{name}.jpg").exists():
             lines += ["", f"## {name}", "", f"![{name}](photo-{name}.jpg)"]
     if "truth" in found:
-        lines += ["", "## Outfits of known truth", "", "| kind | cases | IoU, median | Chamfer to truth, median mm |", "|---|---|---|---|"]
-        lines += [f"| {k} | {v['cases']} | {v['iou']:.3f} | {v['chamfer_mm']:.1f} |" for k, v in found["truth"]["kinds"].items()]
+        lines += [
+            "",
+            "## Outfits of known truth",
+            "",
+            "| kind | cases | IoU, median | Chamfer to truth, median mm |",
+            "|---|---|---|---|",
+        ]
+        lines += [
+            f"| {k} | {v['cases']} | {v['iou']:.3f} | {v['chamfer_mm']:.1f} |"
+            for k, v in found["truth"]["kinds"].items()
+        ]
     (ROOT / "docs" / "results" / "photo.md").write_text("\n".join(lines) + "\n")
 
 
@@ -116,7 +145,11 @@ def main() -> None:
     args = parser.parse_args()
     store = ROOT / "docs" / "results" / "photo.json"
     found = json.loads(store.read_text()) if store.exists() else {"photos": {}}
-    found |= {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count(), "date": time.strftime("%Y-%m-%d")}
+    found |= {
+        "machine": platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "date": time.strftime("%Y-%m-%d"),
+    }
     for name in args.only:
         if name == "truth":
             from truth import run_truth

@@ -63,7 +63,9 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
             garment = tests[number % len(tests)]
             meshes[name] = Mesh(models.draper.drape(garment, posed).vertices[0], garment.mesh.faces)
         parts = [*meshes.values(), Mesh(posed.mesh.vertices[0], models.body.faces)]
-        renderer = models.renderer_of([m.faces for m in parts], list(range(len(parts))), [len(m.vertices) for m in parts])
+        renderer = models.renderer_of(
+            [m.faces for m in parts], list(range(len(parts))), [len(m.vertices) for m in parts]
+        )
         image = renderer([m.vertices for m in parts], camera, SIZE)
         points = models.body.landmarks(posed)[0]
         pixels = camera.project(points)

@@ -14,9 +14,24 @@ from recon.descend import Descended, Descent, descend
 from recon.losses import robust_distance
 from recon.types import BodyPose, Camera, Photo, PosedBody
 
-BONES = ((11, 13), (13, 15), (12, 14), (14, 16), (23, 25), (25, 27), (24, 26), (26, 28), (11, 12), (23, 24), (11, 23), (12, 24))
+BONES = (
+    (11, 13),
+    (13, 15),
+    (12, 14),
+    (14, 16),
+    (23, 25),
+    (25, 27),
+    (24, 26),
+    (26, 28),
+    (11, 12),
+    (23, 24),
+    (11, 23),
+    (12, 24),
+)
 """Pairs of BlazePose landmarks whose directions in space are compared with the network's guess."""
-TRUST = torch.tensor([1.0] + [0.3] * 6 + [0.7] * 2 + [0.3] * 2 + [1.0] * 4 + [0.8] * 2 + [0.2] * 6 + [1.0] * 6 + [0.4] * 4)
+TRUST = torch.tensor(
+    [1.0] + [0.3] * 6 + [0.7] * 2 + [0.3] * 2 + [1.0] * 4 + [0.8] * 2 + [0.2] * 6 + [1.0] * 6 + [0.4] * 4
+)
 """(33,) how far each landmark is trusted: trunk and limbs fully, finger and eye points little."""
 
 

@@ -101,7 +101,9 @@ def silhouette(pixels: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> 
     return torch.from_numpy(image) > 0
 
 
-def retrieve(name: str, values: dict[str, Tensor], photo: Photo, models: Models, settings: GarmentFit, tick=None) -> Tensor:
+def retrieve(
+    name: str, values: dict[str, Tensor], photo: Photo, models: Models, settings: GarmentFit, tick=None
+) -> Tensor:
     """Codes by the overlap of their draped silhouettes with the mask, best first.
 
     Pixels under an outer garment's mask count neither for nor against, like hair and hands.
@@ -149,7 +151,9 @@ def anchor_loss(values: dict[str, Tensor], anchors: dict[str, Tensor]) -> Tensor
 class GarmentLoss:
     """The loss of one garment's descent at one level (ISP Eq. 11, 18-23; DrapeNet Eq. 12)."""
 
-    def __init__(self, name, outer: list[Layer], anchors, photo: Photo, models: Models, settings: GarmentFit, long_side: int):
+    def __init__(
+        self, name, outer: list[Layer], anchors, photo: Photo, models: Models, settings: GarmentFit, long_side: int
+    ):
         self.outer, self.anchors, self.photo, self.models, self.settings = outer, anchors, photo, models, settings
         self.decoder = models.decoders[name]
         self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
@@ -169,7 +173,9 @@ class GarmentLoss:
         weights = torch.tensor([s.outer] * len(self.outer) + [1.0])
         gap = BodyContact(posed.mesh.vertices[0], models.body.faces).signed_distance(mine)
         loss = (weights * overlap).sum()
-        loss = loss + s.pull * overlap[-1].detach() ** 2 * chamfer_pull(camera.project(mine), self.at.fields[-1], self.targets)
+        loss = loss + s.pull * overlap[-1].detach() ** 2 * chamfer_pull(
+            camera.project(mine), self.at.fields[-1], self.targets
+        )
         loss = loss + s.contact * depth_penalty(gap, s.clearance) / 10
         loss = loss + s.mahalanobis * mahalanobis(values["latent"], self.decoder.codes)
         loss = loss + s.anchor * anchor_loss(values, self.anchors) / 10
@@ -177,7 +183,13 @@ class GarmentLoss:
 
 
 def fit_garment(
-    name: str, values: dict[str, Tensor], outer: list[Layer], photo: Photo, models: Models, settings: GarmentFit, tick=None
+    name: str,
+    values: dict[str, Tensor],
+    outer: list[Layer],
+    photo: Photo,
+    models: Models,
+    settings: GarmentFit,
+    tick=None,
 ) -> tuple[dict[str, Tensor], Layer]:
     """Find the code of one garment; body and camera settle with it, outer layers stay as they are and stay rendered.
 

@@ -15,7 +15,9 @@ from recon.losses import hard_iou
 from recon.types import Mesh, Photo
 
 
-def overlaps(meshes: dict[str, Mesh], values: dict[str, Tensor], photo: Photo, models: Models, at: Level) -> dict[str, float]:
+def overlaps(
+    meshes: dict[str, Mesh], values: dict[str, Tensor], photo: Photo, models: Models, at: Level
+) -> dict[str, float]:
     """Name -> intersection over union of the rendered layer with its mask, occlusion included, ignored pixels left out."""
     with torch.no_grad():
         posed = models.body.pose(to_body(values))

@@ -127,7 +127,9 @@ def fit_evidence(
     Returns:
         Body and camera parameters; the layers at rest, outermost first; name -> refined posed mesh.
     """
-    values = run.stage("body", lambda s: fit_body(photo, models.body, models.renderer_of, s, tick), config=config.body_fit)
+    values = run.stage(
+        "body", lambda s: fit_body(photo, models.body, models.renderer_of, s, tick), config=config.body_fit
+    )
     layers: list[Layer] = []
     for name in photo.garments:
         values, layer = run.stage(
@@ -136,7 +138,5 @@ def fit_evidence(
             config=config.garment_fit,
         )
         layers.append(layer)
-    meshes = run.stage(
-        "refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement
-    )
+    meshes = run.stage("refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement)
     return values, layers, meshes

@@ -124,7 +124,9 @@ def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, roun
         n = len(x)
         of_faces = torch.zeros_like(x)
         of_faces.index_reduce_(0, faces.reshape(-1), move[n:].repeat_interleave(3, 0), "amax", include_self=True)
-        low = torch.zeros_like(x).index_reduce_(0, faces.reshape(-1), move[n:].repeat_interleave(3, 0), "amin", include_self=True)
+        low = torch.zeros_like(x).index_reduce_(
+            0, faces.reshape(-1), move[n:].repeat_interleave(3, 0), "amin", include_self=True
+        )
         spread = torch.where(of_faces.abs() > low.abs(), of_faces, low)
         x = x + torch.where(move[:n].abs() > spread.abs(), move[:n], spread) * 1.05
     return x

@@ -83,12 +83,17 @@ def versions() -> dict[str, str]:
     return found
 
 
-def measure_all(values: dict[str, Tensor], layers: list[Layer], meshes: dict[str, Mesh], photo: Photo, models: Models) -> dict:
+def measure_all(
+    values: dict[str, Tensor], layers: list[Layer], meshes: dict[str, Mesh], photo: Photo, models: Models
+) -> dict:
     """Figures per garment and of the whole: keys ``garments`` and ``body`` of ``result.json``."""
     at = level(photo, 512).pick(tuple(layer.name for layer in layers))
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
-        coded = {n: Mesh(models.draper.drape(g, posed).vertices[0], g.mesh.faces) for n, g in ((x.name, x.garment) for x in layers)}
+        coded = {
+            n: Mesh(models.draper.drape(g, posed).vertices[0], g.mesh.faces)
+            for n, g in ((x.name, x.garment) for x in layers)
+        }
     contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
     refined, by_code = overlaps(meshes, values, photo, models, at), overlaps(coded, values, photo, models, at)
     garments = {}
@@ -125,7 +130,12 @@ def write_results(
         "versions": versions(),
         **measure_all(values, layers, meshes, photo, models),
         "camera": {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(), "size": list(camera.size)},
-        "body_model": {"name": config.body, "shape": place.shape[0].tolist(), "pose": place.pose[0].tolist(), "translation": place.translation[0].tolist()},
+        "body_model": {
+            "name": config.body,
+            "shape": place.shape[0].tolist(),
+            "pose": place.pose[0].tolist(),
+            "translation": place.translation[0].tolist(),
+        },
         "confidence": photo.confidence,
         "notes": list(photo.notes),
     }

@@ -58,12 +58,16 @@ def descend(
     """
     free = {k: start[k].detach().clone().requires_grad_() for k in sizes}
     fixed = {k: v.detach() for k, v in start.items() if k not in sizes}
-    adam = torch.optim.Adam([{"params": [free[k]], "lr": s * settings.rate} for k, s in sizes.items()], betas=(0.9, 0.95))
+    adam = torch.optim.Adam(
+        [{"params": [free[k]], "lr": s * settings.rate} for k, s in sizes.items()], betas=(0.9, 0.95)
+    )
     base = [g["lr"] for g in adam.param_groups]
     out = Descended({k: v.detach().clone() for k, v in {**fixed, **free}.items()}, float("inf"))
     mark, marked, bad, shrink = float("inf"), 0, 0, 1.0
     for step in range(settings.steps):
-        fall = settings.final + (1 - settings.final) * 0.5 * (1 + torch.cos(torch.tensor(torch.pi * step / settings.steps)).item())
+        fall = settings.final + (1 - settings.final) * 0.5 * (
+            1 + torch.cos(torch.tensor(torch.pi * step / settings.steps)).item()
+        )
         for group, lr in zip(adam.param_groups, base):
             group["lr"] = lr * fall * shrink
         adam.zero_grad()

@@ -57,6 +57,8 @@ class PosedBody:
     """(B, 24, 4, 4) rest space -> world per joint (translation included): v = sum_j w_j (T_j [v_rest; 1])."""
     weights: Tensor
     """(V, 24) skinning weights, rows sum to 1."""
+    shape: Tensor
+    """(B, S) the shape coefficients that it was made with."""
 
 
 @dataclass(frozen=True)

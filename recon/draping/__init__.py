@@ -1,1 +1,16 @@
 """Drapers: a rest-pose garment onto a posed body."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from recon.types import Garment, Mesh, PosedBody
+
+
+class Draper(Protocol):
+    """What every draper answers to."""
+
+    def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
+        """The garment on the posed bodies, (B, N, 3); ``under``: the layers beneath, already draped."""
+        ...

@@ -35,7 +35,10 @@ def made_photo(body) -> Photo:
     return Photo(
         rgb=torch.full((*SIZE, 3), 128, dtype=torch.uint8),
         person=person.float(),
-        garments={"top": person & (rows > shoulders) & (rows <= hips), "trousers": person & (rows > hips) & (rows < ankles)},
+        garments={
+            "top": person & (rows > shoulders) & (rows <= hips),
+            "trousers": person & (rows > hips) & (rows < ankles),
+        },
         ignore=torch.zeros(SIZE, dtype=torch.bool),
         landmarks=torch.cat([camera.project(points), torch.ones(33, 1)], 1).detach(),
         landmarks_world=(points - (points[23] + points[24]) / 2).detach(),

@@ -16,7 +16,9 @@ def photo() -> Photo:
     ignore = torch.zeros(100, 80, dtype=torch.bool)
     ignore[20:30] = True
     blank = torch.zeros(100, 80, 3, dtype=torch.uint8)
-    return Photo(blank, person, {"top": top, "trousers": ~top & (person > 0)}, ignore, torch.zeros(33, 3), torch.zeros(33, 3))
+    return Photo(
+        blank, person, {"top": top, "trousers": ~top & (person > 0)}, ignore, torch.zeros(33, 3), torch.zeros(33, 3)
+    )
 
 
 def test_window_holds_the_person_and_stays_in_the_photo(photo):
@@ -39,7 +41,9 @@ def test_camera_of_the_window_sees_the_same_points(photo):
     at = level(photo, 64)
     point = torch.tensor([[0.1, 0.2, 2.0]])
     x0, y0, x1, y1 = at.window
-    expected = (camera.project(point) - torch.tensor([x0, y0])) * torch.tensor([at.size[1] / (x1 - x0), at.size[0] / (y1 - y0)])
+    expected = (camera.project(point) - torch.tensor([x0, y0])) * torch.tensor(
+        [at.size[1] / (x1 - x0), at.size[0] / (y1 - y0)]
+    )
     torch.testing.assert_close(at.camera(camera).project(point), expected)
 
 
