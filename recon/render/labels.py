@@ -43,7 +43,8 @@ class LabelRenderer:
         step: float = 1.0,
     ):
         if not len(faces) == len(labels) == len(n_vertices) > 0:
-            raise ValueError(f"render: found {len(faces)} meshes, {len(labels)} labels, {len(n_vertices)} vertex counts; wanted as many of each")
+            found = f"{len(faces)} meshes, {len(labels)} labels, {len(n_vertices)} vertex counts"
+            raise ValueError(f"render: found {found}; wanted as many of each")
         self.n_vertices = [int(n) for n in n_vertices]
         self.labels = [-1 if label is None else int(label) for label in labels]
         self.n_labels = max(self.labels) + 1
@@ -100,9 +101,7 @@ class LabelRenderer:
 
     def _image(self, scene: RayScene, value: Tensor, view: View, grid: int) -> Tensor:
         h, w = view.size
-        centres = [((torch.arange(n * grid, device=value.device) + 0.5) / grid - n / 2) / view.scale for n in (h, w)]
-        v, u = torch.meshgrid(*centres, indexing="ij")
-        seen = scene.values(torch.stack([u.reshape(-1), v.reshape(-1)], 1), value).reshape(h, grid, w, grid)
+        seen = scene.values(view.grid(grid, value.device), value).reshape(h, grid, w, grid)
         cells = [seen[:, i, :, j].contiguous() for i in range(grid) for j in range(grid)]
         return torch.stack([sum((cell == k + 1).float() for cell in cells) for k in range(self.n_labels)]) / grid**2
 
@@ -132,7 +131,7 @@ class _Coverage(torch.autograd.Function):
         keep = renderer._visible_faces(front, -volumes, outside)
         value = renderer._value[keep]
         scene = scene_on(points.device)
-        scene.set(points / points.new_tensor([view.scale, view.scale, 1.0]), renderer._faces[keep])
+        scene.set(view.traced(points), renderer._faces[keep])
         image = renderer._image(scene, value, view, grid).to(points.dtype)
         if ctx.needs_input_grad[0]:  # now, while the scene holds these meshes
             at = edge_points(points, renderer._candidates(front, outside), view.size, renderer.step)

@@ -39,8 +39,25 @@ class View:
         return float(2 ** (max(self.size) - 1).bit_length())
 
     def points(self, vertices: Tensor) -> Tensor:
-        """(V, 3) world [m] -> (V, 3) homogeneous image points: x / z, y / z = output pixels from the image's centre, z = depth."""
+        """(V, 3) world [m] -> (V, 3) homogeneous image points.
+
+        x / z and y / z are output pixels from the image's centre, z is the depth [m].
+        """
         return vertices @ self.matrix.T.to(vertices) + self.offset.to(vertices)
+
+    def directions(self, world: Tensor) -> Tensor:
+        """(N, 3) world directions -> homogeneous image directions (the map of points is affine)."""
+        return world @ self.matrix.T.to(world)
+
+    def traced(self, points: Tensor) -> Tensor:
+        """(N, 3) homogeneous image points or directions, scaled to the traced space."""
+        return points / points.new_tensor([self.scale, self.scale, 1.0])
+
+    def grid(self, n: int, device: torch.device) -> Tensor:
+        """(h n w n, 2) slopes of the rays through a regular n x n grid in each pixel, row by row of the finer image."""
+        centres = [((torch.arange(m * n, device=device) + 0.5) / n - m / 2) / self.scale for m in self.size]
+        v, u = torch.meshgrid(*centres, indexing="ij")
+        return torch.stack([u.reshape(-1), v.reshape(-1)], 1)
 
 
 def view_of(camera: Camera, size: tuple[int, int] | None = None, window: Window | None = None) -> View:
@@ -59,9 +76,9 @@ def view_of(camera: Camera, size: tuple[int, int] | None = None, window: Window 
 
 
 def outcodes(points: Tensor, size: tuple[int, int]) -> Tensor:
-    """(V,) uint8 bits of the image's half spaces that each homogeneous point lies outside of (left, right, top, bottom, behind).
+    """(V,) uint8, one bit per half space of the image that a homogeneous point lies outside of.
 
-    A face or an edge whose corners share a bit can't be seen. Holds for points behind the camera as well.
+    Left, right, top, bottom, behind. A face or an edge whose corners share a bit can't be seen. Holds for points behind the camera as well.
     """
     h, w = size
     x, y, z = points.unbind(1)
