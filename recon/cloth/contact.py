@@ -1,0 +1,76 @@
+"""Distance to a body, with gradients: Warp finds the closest triangle, torch recomputes the point on it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+wp.config.quiet = True
+
+REACH = 2.0
+"""Closest points are searched for within this distance: more than any body's depth [m]."""
+
+
+@wp.kernel
+def _closest(
+    mesh: wp.uint64,
+    reach: float,
+    points: wp.array(dtype=wp.vec3),
+    face: wp.array(dtype=int),
+    weights: wp.array(dtype=wp.vec3),
+    sign: wp.array(dtype=float),
+):
+    i = wp.tid()
+    hit = wp.mesh_query_point_sign_normal(mesh, points[i], reach)
+    face[i] = hit.face
+    weights[i] = wp.vec3(hit.u, hit.v, 1.0 - hit.u - hit.v)
+    sign[i] = hit.sign
+    if not hit.result:
+        face[i] = -1
+
+
+class BodyContact:
+    """Signed distances to one closed body mesh; a new one for each pose."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor):
+        """``vertices`` (V, 3) [m], may require gradients; ``faces`` (F, 3), outward."""
+        self.vertices, self.faces = vertices, faces
+        self.device = str(vertices.device)
+        points = wp.from_torch(vertices.detach().float().contiguous(), dtype=wp.vec3)
+        indices = wp.array(faces.cpu().numpy().astype(np.int32).ravel(), dtype=int, device=self.device)
+        self.mesh = wp.Mesh(points, indices)
+
+    def closest(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Face (N,), barycentric weights (N, 3) and side (N,) (+1 outside) of the closest points; no gradients.
+
+        Raises ``ValueError`` for points that are not finite or further than ``REACH`` away.
+        """
+        n = len(points)
+        asked = wp.from_torch(points.detach().float().contiguous(), dtype=wp.vec3)
+        face = wp.empty(n, dtype=int, device=self.device)
+        weights = wp.empty(n, dtype=wp.vec3, device=self.device)
+        sign = wp.empty(n, dtype=float, device=self.device)
+        if n:
+            wp.launch(_closest, n, inputs=[self.mesh.id, REACH, asked, face, weights, sign], device=self.device)
+        face = wp.to_torch(face).long()
+        if (face < 0).any():
+            raise ValueError(f"{int((face < 0).sum())} of {n} points are not within {REACH} m of the body")
+        return face, wp.to_torch(weights).to(points.dtype), wp.to_torch(sign).to(points.dtype)
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """(N,) distance [m], negative inside; differentiable in ``points`` (N, 3) and in the body's vertices."""
+        face, weights, sign = self.closest(points)
+        corners = self.vertices.to(points.dtype)[self.faces[face]]
+        away = points - (corners * weights[..., None]).sum(1)
+        square = (away * away).sum(-1)
+        # On the surface the direction is undefined: there the face's normal carries the gradient.
+        normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = (away * normal).sum(-1) / normal.norm(dim=-1).clamp_min(1e-12)
+        on = square < 1e-12
+        return torch.where(on, flat, sign * torch.where(on, torch.ones_like(square), square).sqrt())
+
+    def penetrating(self, points: Tensor) -> Tensor:
+        """(N,) bool, which points are inside the body."""
+        return self.closest(points)[2] < 0

@@ -1,0 +1,160 @@
+"""From a flat pattern to a garment at rest on the body, and the gate that it must pass."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import Cloth, Fabric, stretch
+from recon.cloth.intersections import self_intersections
+from recon.cloth.solve import polish
+from recon.cloth.xpbd import Constraints, body_mesh, settle
+from recon.garments.patterns import Pattern, weld, welded
+from recon.garments.patterns_body import Measures
+from recon.garments.patterns_place import BodyRelief
+from recon.types import Garment
+
+STRETCH_LIMIT = 1.03
+"""95th percentile of the triangles' largest stretch that the gate lets pass."""
+POLISH_FABRIC = Fabric().scaled(stretch=50.0, bending=2.0)
+"""Ready-to-wear cloth hardly stretches under its own weight; SNUG's cotton would sag by several percent."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the gate looks at."""
+
+    inside_vertices: int
+    """Garment vertices inside the body."""
+    inside_faces: int
+    """Face centres inside the body."""
+    stretch_p95: float
+    """95th percentile of the largest stretch."""
+    crossings: int
+    """Pairs of faces that pass through each other."""
+    ugly: str = ""
+    """What makes it no garment (slipped down, flown off ...), else empty."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the garment may enter the data set."""
+        clean = self.inside_vertices == self.inside_faces == self.crossings == 0 and not self.ugly
+        return clean and self.stretch_p95 < STRETCH_LIMIT
+
+    @property
+    def reason(self) -> str:
+        """The first thing wrong, in a word; empty if it passed."""
+        if self.inside_vertices or self.inside_faces:
+            return "in the body"
+        if self.crossings:
+            return "self-intersection"
+        if self.stretch_p95 >= STRETCH_LIMIT:
+            return "stretched"
+        return self.ugly
+
+    def as_dict(self) -> dict:
+        """Plain values for a report."""
+        return asdict(self)
+
+
+class FittingRoom:
+    """One body with everything that draping patterns on it needs."""
+
+    def __init__(self, measures: Measures):
+        self.measures = measures
+        self.relief = BodyRelief.of(measures)
+        self.mesh = body_mesh(measures.vertices, measures.faces)
+        vertices = torch.tensor(measures.vertices, dtype=torch.float32)
+        self.contact = BodyContact(vertices, torch.tensor(measures.faces))
+
+    def drape(self, pattern: Pattern) -> Garment:
+        """The garment at rest on the body; (V, 3) float32 vertices."""
+        garment = weld(pattern, self.measures, self.relief)
+        cloth = Cloth.from_garment(garment, POLISH_FABRIC)
+        limits = constraints(pattern, garment, cloth)
+        rest = settle(garment.mesh.vertices.numpy(), limits, self.mesh)
+        start = torch.tensor(rest, dtype=torch.float32)
+        side = np.zeros(len(rest)) if limits.side is None else limits.side
+        vertices = polish(
+            cloth,
+            start,
+            self.contact,
+            rest=torch.tensor(limits.rest, dtype=torch.float32),
+            held=torch.tensor(limits.held),
+            side=torch.tensor(side, dtype=torch.float32),
+        )
+        return replace(garment, mesh=garment.mesh.with_vertices(vertices))
+
+    def judge(self, garment: Garment) -> Verdict:
+        """Look at a draped garment."""
+        x = garment.mesh.vertices
+        if not torch.isfinite(x).all() or x.abs().max() > 2.0:
+            return Verdict(0, 0, float("inf"), 0, "flew off")
+        cloth = Cloth.from_garment(garment)
+        return Verdict(
+            int(self.contact.penetrating(x).sum()),
+            int(self.contact.penetrating(x[garment.mesh.faces].mean(1)).sum()),
+            float(torch.quantile(stretch(cloth, x), 0.95)),
+            len(self_intersections(x, garment.mesh.faces)),
+        )
+
+
+def constraints(pattern: Pattern, garment: Garment, cloth: Cloth) -> Constraints:
+    """What the simulator needs to know of a garment."""
+    vertex = garment.vertex_of_point.numpy()
+    hinges = cloth.hinges.numpy()
+    return Constraints(
+        edges=cloth.edges.numpy(),
+        edge_lengths=cloth.edge_lengths.double().numpy(),
+        bends=hinges[:, 2:],
+        bend_lengths=_flat_spans(cloth),
+        rest=_pattern_positions(pattern, vertex),
+        held=np.unique(vertex[pattern.held]),
+        side=_leg_sides(pattern, vertex) if pattern.kind == "trousers" else None,
+    )
+
+
+def _flat_spans(cloth: Cloth) -> NDArray:
+    """(H,) distance between the vertices opposite of each hinge when it lies flat [m]."""
+    hinges = cloth.hinges.numpy()
+    edges, lengths = cloth.edges.numpy(), cloth.edge_lengths.double().numpy()
+    count = int(edges.max()) + 1
+    keys = edges[:, 0] * count + edges[:, 1]  # sorted, as edges are
+
+    def length(a: NDArray, b: NDArray) -> NDArray:
+        return lengths[np.searchsorted(keys, np.minimum(a, b) * count + np.maximum(a, b))]
+
+    a, b, c, d = hinges.T
+    base = length(a, b)
+    feet, heights = [], []
+    for tip in (c, d):
+        to_a, to_b = length(a, tip), length(b, tip)
+        along = (to_a**2 - to_b**2 + base**2) / (2 * base)
+        feet.append(along)
+        heights.append(np.sqrt(np.maximum(to_a**2 - along**2, 1e-12)))
+    return np.hypot(feet[0] - feet[1], heights[0] + heights[1])
+
+
+def _pattern_positions(pattern: Pattern, vertex: NDArray) -> NDArray:
+    """(V, 3) flat positions with a metre between the panels; seam vertices lie with the front."""
+    out = np.zeros((vertex.max() + 1, 3))
+    for panel in (1, 0):
+        mine = pattern.panel_of_point == panel
+        out[vertex[mine], :2] = pattern.points[mine]
+        out[vertex[mine], 2] = -float(panel)
+    return out
+
+
+def _leg_sides(pattern: Pattern, vertex: NDArray) -> NDArray:
+    """(V,) 1 for the left leg, -1 for the right, 0 above the crotch."""
+    out = np.zeros(vertex.max() + 1)
+    below = pattern.points[:, 1] < pattern.parameters["crotch_y"]
+    out[vertex[below]] = np.sign(pattern.points[below, 0])
+    return out
+
+
+__all__ = ["FittingRoom", "Verdict", "constraints", "welded"]
