@@ -1,0 +1,273 @@
+"""The pose-seeded split of a person into the garments that the user names, without a parsing network.
+
+Each layer (jacket, top or dress, lower garment, skin, hair, shoes) has a colour mixture learned from this photo alone,
+at seeds that the pose gives, and a place: sleeves, hems and waist as one-dimensional splits (``zones``), skin only where
+skin can be (head, beyond sleeves and hems, a bared waist). Colour and place make one energy a pixel; mean-field steps
+with an edge-aware filter as the message smooth it (Kraehenbuehl and Koltun 2011, with He's guided filter in place of the
+bilateral one); the mixtures are then learned again from what was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from recon.perceive.bodymap import ARM_L, ARM_R, HEAD, LEG_L, LEG_R, TORSO, BodyMap
+from recon.perceive.colours import FLOOR, fit_mixture, lab
+from recon.perceive.segment import guided
+from recon.perceive.zones import HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, best_end, waist_split
+
+MESSAGE = 6.0
+"""Weight of the neighbours' opinion against a pixel's own log-likelihoods."""
+ROUNDS, STEPS = 2, 4
+NEVER = -60.0
+"""Energy of a layer that cannot be here."""
+MIN_SEED = 40
+"""Fewer pixels teach no colour."""
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """What is worn, by layer; unnamed layers are there all the same, so that they are not taken for a named one."""
+
+    zones: dict[int, Zone]
+    """Layer -> zone; a dress has no LOWER."""
+    names: dict[int, str]
+    """Layer -> the user's name, for the named ones."""
+
+    @staticmethod
+    def of(garments: Sequence[str]) -> Outfit:
+        """The outfit of the user's garment names (keys of ``ZONES``, at most one a layer)."""
+        names = {ZONES[name].layer: name for name in garments}
+        zones = {layer: ZONES[name] for layer, name in names.items()}
+        if TOP not in zones:
+            zones[TOP] = ZONES["top"]
+        if LOWER not in zones and names.get(TOP) != "dress":
+            zones[LOWER] = ZONES["trousers"]
+        return Outfit(zones, names)
+
+    @property
+    def dress(self) -> bool:
+        """Whether one piece covers trunk and legs."""
+        return LOWER not in self.zones
+
+
+@dataclass
+class Ends:
+    """Where the garments end on this photo."""
+
+    sleeve: dict[int, float] = field(default_factory=dict)
+    """Arm part -> end of the outer sleeve along the arm."""
+    hem: dict[int, float] = field(default_factory=dict)
+    """Leg part -> end of the lower garment (or dress) along the leg."""
+    upper: float = 0.0
+    """Height where the upper garment ends, on the trunk."""
+    lower: float = 0.0
+    """Height where the lower garment begins."""
+    jacket: float = 0.0
+    """Height where the jacket ends."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """'waist', 'jacket', 'sleeve', 'hem' -> how far colours support the end, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """The split of a window."""
+
+    belief: np.ndarray
+    """(h, w, LAYERS) probabilities, zero outside of the person."""
+    colour: np.ndarray
+    """(h, w, LAYERS) colour log-likelihoods alone."""
+    ends: Ends
+    """Where garments end."""
+
+
+def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) -> Parsed:
+    """Layer probabilities of a window.
+
+    Args:
+        rgb: (h, w, 3) uint8.
+        person: (h, w) bool.
+        body: the window's body coordinates.
+        outfit: what is worn.
+    """
+    colours = lab(rgb)
+    inner = cv2.erode(person.astype(np.uint8), np.ones((3, 3))) > 0
+    seeds = _seeds(colours, inner, body, outfit)
+    samples = seeds
+    for _ in range(ROUNDS):
+        colour = _colour(colours, samples)
+        ends = find_ends(colour, inner, body, outfit)
+        belief = smooth(rgb, colour + place(body, outfit, ends), person)
+        best, sure = belief.argmax(-1), (belief.max(-1) > 0.85) & inner
+        samples = {k: np.vstack([x, *[colours[sure & (best == k)]] * 2]) for k, x in seeds.items()}
+    return Parsed(belief, colour, ends)
+
+
+def _seeds(colours: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) -> dict[int, np.ndarray]:
+    """Layer -> (N, 3) colours at places where the pose makes the layer near certain."""
+    pick: dict[int, np.ndarray] = {}
+    face = body.face & person
+    if face.sum() < MIN_SEED:
+        face = (body.head < 0.5) & person
+    skin = fit_mixture(colours[face], 2).log_likelihood(colours) if face.sum() >= MIN_SEED else None
+    like_face = skin > np.percentile(skin[face], 20) if skin is not None else np.zeros_like(person)
+    hands = (body.hand < 0.8) & person & like_face
+    pick[SKIN] = face | hands
+    pick[HAIR] = person & (body.head < 1.25) & (body.up > body.chin + 0.15) & ~like_face & ~face
+    pick[SHOE] = person & (body.foot < 0.5)
+    trunk = body.core & person & (body.part == TORSO)
+    pick[TOP] = trunk & ~like_face if (trunk & ~like_face).sum() > 0.5 * trunk.sum() else trunk
+    if not outfit.dress:
+        legs = body.thighs & person & (body.hand > 1.2) & (body.up < -0.05)
+        pick[LOWER] = legs & ~like_face if (legs & ~like_face).sum() > 0.3 * legs.sum() else legs
+    if JACKET in outfit.zones:
+        pick |= _jacket_seeds(colours, person, body, like_face, pick[TOP])
+    return {k: colours[m] for k, m in pick.items() if m.sum() >= MIN_SEED}
+
+
+def _jacket_seeds(
+    colours: np.ndarray, person: np.ndarray, body: BodyMap, like_face: np.ndarray, trunk: np.ndarray
+) -> dict[int, np.ndarray]:
+    """JACKET from sleeves and sides; TOP from the trunk's middle, where the jacket's colours explain it badly."""
+    arms = ((body.part == ARM_L) | (body.part == ARM_R)) & (body.arm > 0.2) & (body.arm < 1.5)
+    sides = (body.part == TORSO) & (np.abs(body.across) > 0.7) & (body.up > 0.3) & (body.up < 0.85)
+    jacket = (arms | sides) & person & ~like_face
+    if jacket.sum() < MIN_SEED:
+        return {}
+    likely = fit_mixture(colours[jacket]).log_likelihood(colours)
+    middle = person & (np.abs(body.across) < 0.35) & (body.up > 0.15) & (body.up < body.chin - 0.12)
+    strange = middle & (likely < np.percentile(likely[jacket], 10) - 1) & ~(like_face & (body.neck < 0.4))
+    return {JACKET: jacket, TOP: strange}
+
+
+def _colour(colours: np.ndarray, samples: dict[int, np.ndarray]) -> np.ndarray:
+    """(h, w, LAYERS) log-likelihoods of the colours; layers without samples are never likely."""
+    out = np.full((*colours.shape[:2], LAYERS), NEVER, np.float32)
+    for layer, x in samples.items():
+        out[..., layer] = fit_mixture(x, 2 if layer == HAIR else 4).log_likelihood(colours)
+    return out
+
+
+def find_ends(colour: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) -> Ends:
+    """Sleeves, hems and waists from colours alone."""
+    ends, evidence = Ends(), {}
+    outer = np.maximum(colour[..., JACKET], colour[..., TOP])
+    sleeved = outfit.zones.get(JACKET, outfit.zones[TOP])
+    skin = np.maximum(colour[..., SKIN], FLOOR)
+    for arm in (ARM_L, ARM_R):
+        on = person & (body.part == arm)
+        end, sure = best_end(body.arm[on], (skin - outer)[on], sleeved.sleeve, -0.3, 2.5)
+        ends.sleeve[arm] = end
+        evidence[f"sleeve {arm}"] = sure
+    cloth = colour[..., TOP if outfit.dress else LOWER]
+    bare = np.maximum(skin, colour[..., SHOE])
+    zone = outfit.zones[TOP if outfit.dress else LOWER]
+    for leg in (LEG_L, LEG_R):
+        on = person & (body.part == leg) & (body.hand > 1.2)
+        end, sure = best_end(body.leg[on], (bare - cloth)[on], zone.hem, 0.0, 2.5)
+        ends.hem[leg] = end
+        evidence[f"hem {leg}"] = sure
+    if zone.between:  # a skirt ends at one height on both legs
+        ends.hem = dict.fromkeys(ends.hem, float(np.mean(list(ends.hem.values()))))
+    if not outfit.dress:
+        middle = person & (body.part != ARM_L) & (body.part != ARM_R) & (body.part != HEAD) & (body.hand > 1.2)
+        inner = middle & (np.abs(body.across) < (0.45 if JACKET in outfit.zones else 1.1))
+        ends.upper, ends.lower, evidence["waist"] = waist_split(
+            body.up[inner], outer[inner], cloth[inner], skin[inner], outfit.zones[TOP].waist
+        )
+        ends.jacket = ends.upper
+        if JACKET in outfit.zones:
+            side = middle & (np.abs(body.across) > 0.6)
+            ends.jacket, _, evidence["jacket"] = waist_split(
+                body.up[side], colour[..., JACKET][side], cloth[side], skin[side] * 0 + FLOOR, outfit.zones[JACKET].waist
+            )
+    ends.evidence = {k: v for k, v in evidence.items()}
+    return ends
+
+
+def _past(z: np.ndarray, slope: float, most: float) -> np.ndarray:
+    """Cost that grows with the way ``z`` past an end, at most ``most``."""
+    return np.clip(slope * z, 0, most)
+
+
+def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
+    """(h, w, LAYERS) log-priors of place."""
+    out = np.zeros((*body.part.shape, LAYERS), np.float32)
+    arm = (body.part == ARM_L) | (body.part == ARM_R)
+    leg = (body.part == LEG_L) | (body.part == LEG_R)
+    sleeve = np.where(body.part == ARM_L, ends.sleeve[ARM_L], ends.sleeve[ARM_R])
+    hem = np.where(body.part == LEG_L, ends.hem[LEG_L], ends.hem[LEG_R])
+    past_sleeve, past_hem = np.where(arm, body.arm - sleeve, 0), np.where(leg, body.leg - hem, 0)
+    head = np.where(body.part == HEAD, _past(1.15 - body.head, 30, 12), 0)
+    head = head + _past(body.up - body.chin, 25, 10)
+
+    for layer in (JACKET, TOP):
+        if layer in outfit.zones:
+            out[..., layer] -= _past(past_sleeve, 25, 12) + head
+            end = ends.jacket if layer == JACKET else ends.upper
+            below = _past(end - body.up, 20, 12) if not outfit.dress else _past(past_hem, 25, 12)
+            out[..., layer] -= np.where(arm, np.minimum(below, 2), below)
+            out[..., layer] -= _past(0.9 - body.foot, 20, 6)
+        else:
+            out[..., layer] = NEVER
+    if JACKET in outfit.zones:
+        out[..., TOP] -= np.where(arm, 8, 0) + _past(np.abs(body.across) - 0.45, 14, 8)
+        out[..., JACKET] -= _past(0.35 - np.abs(body.across), 4, 1) + _past(0.28 - body.neck, 30, 6)
+    if outfit.dress:
+        out[..., LOWER] = NEVER
+    else:
+        out[..., LOWER] -= _past(body.up - ends.lower, 20, 12) + _past(past_hem, 25, 12) + head
+        out[..., LOWER] -= np.where(arm & (body.up > -0.3), 3, 0)
+        out[..., LOWER] -= _past(0.7 - body.foot, 20, 4)
+    out[..., SKIN] -= _skin_cost(body, arm, leg, past_sleeve, past_hem, ends, outfit)
+    out[..., HAIR] -= _past(body.head - 1.2, 5, 14) + np.where(arm | leg, 4, 0) + np.where(body.face, 3, 0)
+    out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), 20)
+    out[..., SHOE] -= np.minimum(_past(body.foot - 1.0, 4, 8), np.where(past_hem > 0, 2, 8))
+    return out
+
+
+def _skin_cost(
+    body: BodyMap,
+    arm: np.ndarray,
+    leg: np.ndarray,
+    past_sleeve: np.ndarray,
+    past_hem: np.ndarray,
+    ends: Ends,
+    outfit: Outfit,
+) -> np.ndarray:
+    """(h, w) cost of skin: it needs a place as well as a colour."""
+    cost = np.full(body.part.shape, 12.0, np.float32)
+    cost = np.where(arm, _past(-past_sleeve, 25, 12), cost)
+    cost = np.where(leg, _past(-past_hem, 25, 12), cost)
+    cost = np.minimum(cost, _past(body.hand - 0.9, 8, 12))
+    cost = np.minimum(cost, _past(body.head - 1.0, 8, 12))
+    neckline = 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
+    cost = np.minimum(cost, _past(body.neck - neckline, 25, 12))
+    if ends.upper > ends.lower:
+        bared = np.maximum(body.up - ends.upper, ends.lower - body.up)
+        cost = np.minimum(cost, np.where(arm, cost, _past(bared, 25, 12)))
+    return cost
+
+
+def smooth(rgb: np.ndarray, energy: np.ndarray, person: np.ndarray) -> np.ndarray:
+    """(h, w, LAYERS) probabilities: mean-field steps on the energy, messages by a colour-guided filter."""
+    radius = max(3, round(0.012 * max(person.shape)))
+    alive = [k for k in range(LAYERS) if energy[..., k][person].max(initial=NEVER) > NEVER / 2]
+    e = energy[..., alive]
+    on = person.astype(np.float32)
+
+    def softmax(x: np.ndarray) -> np.ndarray:
+        p = np.exp(x - x.max(-1, keepdims=True))
+        return p / p.sum(-1, keepdims=True) * on[..., None]
+
+    weight = np.maximum(guided(rgb, on, radius, 1e-3), 0.05)
+    p = softmax(0.5 * e)
+    for _ in range(STEPS):
+        p = softmax(e * 0.5 + MESSAGE * guided(rgb, p, radius, 1e-3) / weight[..., None])
+    out = np.zeros((*person.shape, LAYERS), np.float32)
+    out[..., alive] = p
+    return out
