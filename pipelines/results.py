@@ -16,6 +16,7 @@ from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size
 from pipelines.measure import body_overlap, geometry, overlaps
+from pipelines.report import colour_of, write_pictures, write_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
 from recon.files.meshes import write_glb, write_obj
@@ -23,16 +24,6 @@ from recon.files.patterns import write_svg
 from recon.types import BodyPose, Camera, Mesh, Photo
 
 SCHEMA = 1
-COLOURS = {
-    "body": (0.80, 0.66, 0.57),
-    "top": (0.36, 0.53, 0.76),
-    "jacket": (0.33, 0.56, 0.45),
-    "trousers": (0.42, 0.42, 0.50),
-    "skirt": (0.78, 0.42, 0.52),
-    "dress": (0.72, 0.45, 0.70),
-}
-"""sRGB colours of body and garments in scenes and pictures; other names share a neutral one."""
-OTHER = (0.82, 0.60, 0.35)
 
 
 @dataclass(frozen=True)
@@ -51,12 +42,6 @@ class FitResult:
     """Rest-pose garments with their panels, outermost first."""
     garments: dict[str, Mesh]
     """Name -> refined mesh (V, 3), welded and open, in the pose of the photo."""
-
-
-def colour_of(name: str) -> tuple[float, float, float]:
-    """The colour of a body or garment in scenes and pictures."""
-    aliases = {"tshirt": "top", "shirt": "top", "tank": "top", "shorts": "trousers"}
-    return COLOURS.get(aliases.get(name, name), OTHER)
 
 
 def grounded(body: Mesh, meshes: dict[str, Mesh], camera: Camera) -> tuple[Mesh, dict[str, Mesh], Camera, Tensor]:
@@ -113,8 +98,6 @@ def write_results(
     config, photo: Photo, models: Models, fitted: tuple[dict[str, Tensor], list[Layer], dict[str, Mesh]], seconds: dict
 ) -> FitResult:
     """Measure, write everything but ``result.json``, then ``result.json`` last (its presence says that all is there)."""
-    from pipelines.report import write_pictures, write_report
-
     begin = time.perf_counter()
     values, layers, meshes = fitted
     out = Path(config.out)
