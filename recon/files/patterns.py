@@ -16,12 +16,14 @@ MARGIN = 40.0
 """White around the pieces [mm]."""
 
 _STYLE = """
-.cut { fill: #fbf7ef; stroke: #1c1c1c; stroke-linejoin: round; fill-rule: evenodd }
-.seam { fill: none; stroke: #b3361b; stroke-linecap: round }
-.open { fill: none; stroke: #1c5d99; stroke-linecap: butt }
-.grain, .notch, .scale { fill: none; stroke: #1c1c1c }
-text { font-family: Helvetica, Arial, sans-serif; fill: #1c1c1c }
-.of-seam { fill: #b3361b } .of-open { fill: #1c5d99 } .name { font-weight: bold }
+.pattern .cut { fill: #fbf7ef; stroke: #1c1c1c; stroke-linejoin: round; fill-rule: evenodd }
+.pattern .seam { fill: none; stroke: #b3361b; stroke-linecap: round }
+.pattern .open { fill: none; stroke: #1c5d99; stroke-linecap: butt }
+.pattern .grain, .pattern .notch, .pattern .scale { fill: none; stroke: #1c1c1c }
+.pattern text { font-family: Helvetica, Arial, sans-serif; fill: #1c1c1c }
+.pattern .of-seam { fill: #b3361b }
+.pattern .of-open { fill: #1c5d99 }
+.pattern .name { font-weight: bold }
 """
 
 
@@ -83,7 +85,7 @@ def pattern_svg(garment: Garment, name: str) -> str:
     body = [_draw(piece, garment.seam_names, numbers, size) for piece in pieces]
     body.append(_foot(f"{name} · {garment.variant or garment.kind}", height, size))
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.2f}mm" height="{height:.2f}mm" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" class="pattern" width="{width:.2f}mm" height="{height:.2f}mm" '
         f'viewBox="0 0 {width:.2f} {height:.2f}">\n<title>{escape(name)}</title>\n<style>{_STYLE}</style>\n'
         f'<rect width="100%" height="100%" fill="#ffffff"/>\n' + "\n".join(body) + "\n</svg>\n"
     )
@@ -238,7 +240,7 @@ def _draw(
         parts.append(_label(text, middle, outward, size, kind))
     low, high = piece.box
     parts.append(_grain(piece, low, high, size, line))
-    return f'<g id="{escape(piece.name).replace(" ", "-")}">\n' + "\n".join(parts) + "\n</g>"
+    return f'<g class="piece" data-name="{escape(piece.name)}">\n' + "\n".join(parts) + "\n</g>"
 
 
 def _middle(run: Run, piece: Piece) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
