@@ -35,16 +35,17 @@ class Body(Protocol):
 
 
 BODIES = {
-    "anny": "recon.bodies.anny",
-    "smpl": "recon.bodies.smpl",
-    "smplh": "recon.bodies.smpl",
-    "smplx": "recon.bodies.smpl",
+    "anny": "recon.bodies.anny:build",
+    "smpl": "recon.bodies.smpl:smpl",
+    "smplh": "recon.bodies.smpl:smplh",
+    "smplx": "recon.bodies.smpl:smplx",
 }
-"""Body name -> the module whose ``build(path, device)`` makes it."""
+"""Body name -> module:builder, called with (path, device)."""
 
 
 def load_body(name: str = "anny", path: str | Path | None = None, device: str | torch.device = "cpu") -> Body:
-    """The named body on ``device``. ``anny`` is embedded; smpl, smplh and smplx need the ``path`` of the user's file."""
+    """The named body on ``device``: ``anny`` is embedded; smpl, smplh and smplx need the ``path`` of a user's file."""
     if name not in BODIES:
         raise UserError(f"body: found {name!r}, wanted one of {', '.join(BODIES)}")
-    return import_module(BODIES[name]).build(path, device)
+    module, builder = BODIES[name].split(":")
+    return getattr(import_module(module), builder)(path, device)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,7 @@ def build(path: str | Path | None = None, device: str | torch.device = "cpu") ->
         with np.load(path, allow_pickle=False) as file:
             data = {k: file[k] for k in file.files}
         missing = {"template", "shape_dirs", "joints", "weights", "faces", "landmark_index"} - set(data)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path}: found no readable npz ({error}), wanted an exported Anny body") from None
     if missing:
         raise UserError(f"{path}: found no {', '.join(sorted(missing))}, wanted an exported Anny body")

@@ -100,7 +100,12 @@ class LinearBody:
             bend = torch.matmul(features.flatten(1), self.pose_dirs.flatten(0, 1).T).unflatten(-1, (-1, 3))
             vertices = vertices + bend
         return PosedBody(
-            rest.with_vertices(skin(vertices, transforms, self.weights)), rest, posed, transforms, self.weights, body.shape
+            rest.with_vertices(skin(vertices, transforms, self.weights)),
+            rest,
+            posed,
+            transforms,
+            self.weights,
+            body.shape,
         )
 
     def landmarks(self, posed: PosedBody) -> Tensor:
