@@ -42,6 +42,8 @@ class BodyMap:
     """Width of the shoulders [working px], guarded against side views."""
     face: np.ndarray
     """(h, w) bool, inside the face's landmarks."""
+    cheeks: np.ndarray
+    """(h, w) bool, between eyes, ears and nose: skin even under a beard, a fringe or a hat."""
     core: np.ndarray
     """(h, w) bool, surely on the trunk: between shoulders and hips, away from their ends."""
     thighs: np.ndarray
@@ -107,14 +109,17 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     legs = {k: _limb(grid, [p[a], p[b], p[c]], (0.24 * width, 0.18 * width)) for k, (a, b, c, _) in LEGS.items()}
     hand = np.minimum(*(_hand(grid, p, c, tip, width) for _, _, c, tip in ARMS.values()))
     foot = np.minimum(*(_foot(grid, p, c, sole, width) for _, _, c, sole in LEGS.values()))
+    def pick(limbs: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        (d0, t0), (d1, t1) = limbs.values()
+        return np.where(d0 <= d1, t0, t1)
+
     near = [outside, head / 1.05, *(arms[k][0] for k in ARMS), *(legs[k][0] for k in LEGS)]
     # Inside the trunk's outline the arms must be clearly nearer: an arm that hangs beside the hips is not in front.
     near[0] = np.where(trunk, np.minimum(near[0], 0.0), near[0])
     part = np.argmin(np.stack(near, -1), -1)
-
-    def pick(limbs: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        (d0, t0), (d1, t1) = limbs.values()
-        return np.where(d0 <= d1, t0, t1)
+    on_leg = np.isin(part, list(LEGS))
+    # A raised or bent thigh is as far below the hips as a hanging one.
+    up = np.where(on_leg, np.minimum(up, -0.85 * pick(legs)), up)
 
     def mix(a: int, b: int, t: float) -> np.ndarray:
         return p[a] + t * (p[b] - p[a])
@@ -128,8 +133,13 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     return BodyMap(
         part=part, up=up, across=across, arm=pick(arms), leg=pick(legs), hand=hand, foot=foot, head=head,
         neck=np.linalg.norm(grid - p[11:13].mean(0) - 0.12 * unit * axis, axis=-1) / width,
-        chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), core=core, thighs=thighs,
+        chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
     )  # fmt: skip
+
+
+def _cheeks(shape: tuple[int, int], p: np.ndarray) -> np.ndarray:
+    ears = [p[7] + 0.2 * (p[0] - p[7]), p[8] + 0.2 * (p[0] - p[8])]
+    return _polygon(shape, np.array([*ears, p[3], p[6], p[0], *(0.5 * (p[7:9] + p[9:11]))]))
 
 
 def _hand(grid: np.ndarray, p: np.ndarray, wrist: int, tips: tuple[int, int], width: float) -> np.ndarray:

@@ -9,6 +9,9 @@ import numpy as np
 
 SPREAD = np.array([30.0, 8.0, 8.0])
 """Variance added to every component, (L, a, b) in OpenCV's 8-bit units: wide enough for shading that no seed shows."""
+SHADED = np.array([160.0, 14.0, 14.0])
+"""The same for skin learned from the face alone: arms and legs are lit otherwise."""
+ITERATIONS = 12
 FLOOR = -18.0
 """Log-likelihoods stop here: an odd button or stripe must not outvote its place on the body."""
 
@@ -40,9 +43,12 @@ class Mixture:
         return out.reshape(colours.shape[:-1])
 
 
-def fit_mixture(colours: np.ndarray, count: int = 4, iterations: int = 12, seed: int = 0) -> Mixture:
-    """Expectation-maximisation on (N, 3) Lab colours, N > 0, from a k-means++ start; deterministic for a seed."""
-    r = np.random.default_rng(seed)
+def fit_mixture(colours: np.ndarray, count: int = 4, spread: np.ndarray = SPREAD) -> Mixture:
+    """Expectation-maximisation on (N, 3) Lab colours, N > 0, from a k-means++ start; deterministic.
+
+    ``spread`` (3,) is the variance that every component gets on top of its own.
+    """
+    r = np.random.default_rng(0)
     x = colours.reshape(-1, 3).astype(np.float64)
     x = x[r.permutation(len(x))[:2500]]
     count = min(count, max(1, len(x) // 60))
@@ -52,7 +58,7 @@ def fit_mixture(colours: np.ndarray, count: int = 4, iterations: int = 12, seed:
         means = np.vstack([means, x[r.choice(len(x), p=d / d.sum())]])
     nearest = ((x[:, None] - means) ** 2).sum(-1).argmin(1)
     p = np.eye(count)[nearest] * 0.9 + 0.1 / count
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         n = p.sum(0) + 1e-9
         weights, means = n / n.sum(), p.T @ x / n[:, None]
         d = x[:, None] - means
@@ -61,4 +67,4 @@ def fit_mixture(colours: np.ndarray, count: int = 4, iterations: int = 12, seed:
         q += np.log(weights) - 0.5 * np.linalg.slogdet(cov)[1]
         p = np.exp(q - q.max(1, keepdims=True))
         p /= p.sum(1, keepdims=True)
-    return Mixture(weights, means, cov + np.diag(SPREAD))
+    return Mixture(weights, means, cov + np.diag(spread))

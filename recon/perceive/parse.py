@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from recon.perceive.bodymap import ARM_L, ARM_R, HEAD, LEG_L, LEG_R, TORSO, BodyMap
-from recon.perceive.colours import FLOOR, fit_mixture, lab
+from recon.perceive.colours import FLOOR, SHADED, SPREAD, fit_mixture, lab
 from recon.perceive.segment import guided
-from recon.perceive.zones import HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, best_end, waist_split
+from recon.perceive.zones import HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, limb_ends, waist_split
 
 MESSAGE = 6.0
 """Weight of the neighbours' opinion against a pixel's own log-likelihoods."""
@@ -98,39 +98,37 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
     inner = cv2.erode(person.astype(np.uint8), np.ones((3, 3))) > 0
     seeds = _seeds(colours, inner, body, outfit)
     samples = seeds
-    for _ in range(ROUNDS):
-        colour = _colour(colours, samples)
+    for k in range(ROUNDS):
+        colour = _colour(colours, samples, first=k == 0)
         ends = find_ends(colour, inner, body, outfit)
         belief = smooth(rgb, colour + place(body, outfit, ends), person)
         best, sure = belief.argmax(-1), (belief.max(-1) > 0.85) & inner
-        samples = {k: np.vstack([x, *[colours[sure & (best == k)]] * 2]) for k, x in seeds.items()}
+        samples = {n: np.vstack([x, *[colours[sure & (best == n)]] * 2]) for n, x in seeds.items()}
     return Parsed(belief, colour, ends)
 
 
 def _seeds(colours: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) -> dict[int, np.ndarray]:
     """Layer -> (N, 3) colours at places where the pose makes the layer near certain."""
-    pick: dict[int, np.ndarray] = {}
-    face = body.face & person
-    if face.sum() < MIN_SEED:
-        face = (body.head < 0.5) & person
-    skin = fit_mixture(colours[face], 2).log_likelihood(colours) if face.sum() >= MIN_SEED else None
-    like_face = skin > np.percentile(skin[face], 20) if skin is not None else np.zeros_like(person)
-    hands = (body.hand < 0.8) & person & like_face
-    pick[SKIN] = face | hands
-    pick[HAIR] = person & (body.head < 1.25) & (body.up > body.chin + 0.15) & ~like_face & ~face
-    pick[SHOE] = person & (body.foot < 0.5)
+    face = next(m for m in (body.cheeks & person, body.face & person, (body.head < 0.5) & person, person) if m.sum() > MIN_SEED)
+    skin = fit_mixture(colours[face], 2, SHADED).log_likelihood(colours)
+    like_face = skin > np.percentile(skin[face], 10) - 1
+    unlike_face = skin < np.percentile(skin[face], 3) - 2
+    pick = {SKIN: face | (body.hand < 0.8) & person & like_face, SHOE: person & (body.foot < 0.5)}
+    hair = person & (body.head < 1.25) & (body.up > body.chin + 0.15) & unlike_face & ~body.face
+    if hair.sum() > 0.06 * (person & (body.head < 1)).sum():  # fewer are eyes and shadows of a bald head
+        pick[HAIR] = hair
     trunk = body.core & person & (body.part == TORSO)
-    pick[TOP] = trunk & ~like_face if (trunk & ~like_face).sum() > 0.5 * trunk.sum() else trunk
+    pick[TOP] = trunk & ~like_face if (trunk & ~like_face).sum() > 0.35 * trunk.sum() else trunk
     if not outfit.dress:
         legs = body.thighs & person & (body.hand > 1.2) & (body.up < -0.05)
         pick[LOWER] = legs & ~like_face if (legs & ~like_face).sum() > 0.3 * legs.sum() else legs
     if JACKET in outfit.zones:
-        pick |= _jacket_seeds(colours, person, body, like_face, pick[TOP])
+        pick |= _jacket_seeds(colours, person, body, like_face)
     return {k: colours[m] for k, m in pick.items() if m.sum() >= MIN_SEED}
 
 
 def _jacket_seeds(
-    colours: np.ndarray, person: np.ndarray, body: BodyMap, like_face: np.ndarray, trunk: np.ndarray
+    colours: np.ndarray, person: np.ndarray, body: BodyMap, like_face: np.ndarray
 ) -> dict[int, np.ndarray]:
     """JACKET from sleeves and sides; TOP from the trunk's middle, where the jacket's colours explain it badly."""
     arms = ((body.part == ARM_L) | (body.part == ARM_R)) & (body.arm > 0.2) & (body.arm < 1.5)
@@ -140,15 +138,16 @@ def _jacket_seeds(
         return {}
     likely = fit_mixture(colours[jacket]).log_likelihood(colours)
     middle = person & (np.abs(body.across) < 0.35) & (body.up > 0.15) & (body.up < body.chin - 0.12)
-    strange = middle & (likely < np.percentile(likely[jacket], 10) - 1) & ~(like_face & (body.neck < 0.4))
+    strange = middle & (likely < np.percentile(likely[jacket], 10) - 1) & ~(like_face & (body.neck < 0.22))
     return {JACKET: jacket, TOP: strange}
 
 
-def _colour(colours: np.ndarray, samples: dict[int, np.ndarray]) -> np.ndarray:
+def _colour(colours: np.ndarray, samples: dict[int, np.ndarray], first: bool) -> np.ndarray:
     """(h, w, LAYERS) log-likelihoods of the colours; layers without samples are never likely."""
     out = np.full((*colours.shape[:2], LAYERS), NEVER, np.float32)
     for layer, x in samples.items():
-        out[..., layer] = fit_mixture(x, 2 if layer == HAIR else 4).log_likelihood(colours)
+        spread = SHADED if layer == SKIN and first else SPREAD
+        out[..., layer] = fit_mixture(x, 2 if layer == HAIR else 4, spread).log_likelihood(colours)
     return out
 
 
@@ -158,21 +157,18 @@ def find_ends(colour: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Out
     outer = np.maximum(colour[..., JACKET], colour[..., TOP])
     sleeved = outfit.zones.get(JACKET, outfit.zones[TOP])
     skin = np.maximum(colour[..., SKIN], FLOOR)
-    for arm in (ARM_L, ARM_R):
-        on = person & (body.part == arm)
-        end, sure = best_end(body.arm[on], (skin - outer)[on], sleeved.sleeve, -0.3, 2.5)
-        ends.sleeve[arm] = end
-        evidence[f"sleeve {arm}"] = sure
+    arms = [person & (body.part == arm) for arm in (ARM_L, ARM_R)]
+    found = limb_ends([(body.arm[on], (skin - outer)[on]) for on in arms], sleeved.sleeve, (-0.3, 2.5), 6.0)
+    for arm, (end, sure) in zip((ARM_L, ARM_R), found):
+        ends.sleeve[arm], evidence[f"sleeve {arm}"] = end, sure
     cloth = colour[..., TOP if outfit.dress else LOWER]
-    bare = np.maximum(skin, colour[..., SHOE])
+    bare = np.maximum(skin, colour[..., SHOE] - np.where(body.leg < 1.8, 8, 0))  # shoes of the trousers' colour
     zone = outfit.zones[TOP if outfit.dress else LOWER]
-    for leg in (LEG_L, LEG_R):
-        on = person & (body.part == leg) & (body.hand > 1.2)
-        end, sure = best_end(body.leg[on], (bare - cloth)[on], zone.hem, 0.0, 2.5)
-        ends.hem[leg] = end
-        evidence[f"hem {leg}"] = sure
-    if zone.between:  # a skirt ends at one height on both legs
-        ends.hem = dict.fromkeys(ends.hem, float(np.mean(list(ends.hem.values()))))
+    legs = [person & (body.part == leg) & (body.hand > 1.2) for leg in (LEG_L, LEG_R)]
+    alike = 30.0 if zone.between else 10.0
+    found = limb_ends([(body.leg[on], (bare - cloth)[on]) for on in legs], zone.hem, (0.0, 2.5), alike)
+    for leg, (end, sure) in zip((LEG_L, LEG_R), found):
+        ends.hem[leg], evidence[f"hem {leg}"] = end, sure
     if not outfit.dress:
         middle = person & (body.part != ARM_L) & (body.part != ARM_R) & (body.part != HEAD) & (body.hand > 1.2)
         inner = middle & (np.abs(body.across) < (0.45 if JACKET in outfit.zones else 1.1))
@@ -185,13 +181,13 @@ def find_ends(colour: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Out
             ends.jacket, _, evidence["jacket"] = waist_split(
                 body.up[side], colour[..., JACKET][side], cloth[side], skin[side] * 0 + FLOOR, outfit.zones[JACKET].waist
             )
-    ends.evidence = {k: v for k, v in evidence.items()}
+    ends.evidence = evidence
     return ends
 
 
 def _past(z: np.ndarray, slope: float, most: float) -> np.ndarray:
     """Cost that grows with the way ``z`` past an end, at most ``most``."""
-    return np.clip(slope * z, 0, most)
+    return np.clip(slope * np.clip(z, -1e3, 1e3), 0, most)
 
 
 def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
@@ -225,7 +221,7 @@ def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
         out[..., LOWER] -= _past(0.7 - body.foot, 20, 4)
     out[..., SKIN] -= _skin_cost(body, arm, leg, past_sleeve, past_hem, ends, outfit)
     out[..., HAIR] -= _past(body.head - 1.2, 5, 14) + np.where(arm | leg, 4, 0) + np.where(body.face, 3, 0)
-    out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), 20)
+    out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), np.float32(20))
     out[..., SHOE] -= np.minimum(_past(body.foot - 1.0, 4, 8), np.where(past_hem > 0, 2, 8))
     return out
 
@@ -245,7 +241,7 @@ def _skin_cost(
     cost = np.where(leg, _past(-past_hem, 25, 12), cost)
     cost = np.minimum(cost, _past(body.hand - 0.9, 8, 12))
     cost = np.minimum(cost, _past(body.head - 1.0, 8, 12))
-    neckline = 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
+    neckline = 0.2 if JACKET in outfit.zones else 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
     cost = np.minimum(cost, _past(body.neck - neckline, 25, 12))
     if ends.upper > ends.lower:
         bared = np.maximum(body.up - ends.upper, ends.lower - body.up)
