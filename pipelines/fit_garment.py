@@ -14,7 +14,7 @@ from pipelines.evidence import Level, level
 from pipelines.fit_body import BodyFit, evidence_loss, to_body, to_camera
 from recon.cloth.contact import BodyContact
 from recon.descend import Descent, descend
-from recon.garments.latents import mahalanobis
+from recon.garments.latents import LatentPrior, of_variants
 from recon.losses import chamfer_pull, depth_penalty, hard_iou, soft_iou_loss
 from recon.types import Camera, Garment, Photo, PosedBody
 
@@ -37,8 +37,8 @@ class GarmentFit:
     """How many of the best retrieved codes get a first, coarse descent; the best goes on."""
     latent_rate: float = 0.06
     """Step size of the code in standard deviations of the learned codes."""
-    mahalanobis: float = 0.004
-    """Weight of the squared Mahalanobis distance from the mean code, per dimension."""
+    mahalanobis: float = 0.01
+    """Weight of the squared Mahalanobis distance from the mean of the codes that the name allows, per dimension."""
     pull: float = 2.0
     """Weight of the distance-field pull, faded out as the overlap grows."""
     contact: float = 0.3
@@ -86,12 +86,6 @@ def photo_size(photo: Photo) -> tuple[int, int]:
     return photo.rgb.shape[0], photo.rgb.shape[1]
 
 
-def allowed_codes(decoder, variants: tuple[str, ...]) -> Tensor:
-    """Indices of the learned codes whose variant the garment's name allows (all where none is marked)."""
-    at = [i for i, v in enumerate(decoder.variants) if v in variants]
-    return torch.tensor(at or list(range(len(decoder.codes))))
-
-
 def silhouette(pixels: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> Tensor:
     """(h, w) bool: the union of projected triangles, without occlusion; (V, 2) pixels, (F, 3) faces."""
     image = np.zeros(size, np.uint8)
@@ -117,7 +111,7 @@ def retrieve(
     weight = at.weight * (1 - hidden)
     camera = at.camera(to_camera(values, photo_size(photo)))
     decoder = models.decoders[name]
-    indices = allowed_codes(decoder, models.variants[name])
+    indices = of_variants(decoder.variants, models.variants[name])
     scores = torch.zeros(len(indices))
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
@@ -156,6 +150,7 @@ class GarmentLoss:
     ):
         self.outer, self.anchors, self.photo, self.models, self.settings = outer, anchors, photo, models, settings
         self.decoder = models.decoders[name]
+        self.prior = LatentPrior.of(self.decoder.codes[of_variants(self.decoder.variants, models.variants[name])])
         self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
         on = torch.nonzero(self.at.targets[-1] > 0.5)
         chosen = torch.linspace(0, max(len(on) - 1, 0), min(len(on), 400)).long()
@@ -177,7 +172,7 @@ class GarmentLoss:
             camera.project(mine), self.at.fields[-1], self.targets
         )
         loss = loss + s.contact * depth_penalty(gap, s.clearance) / 10
-        loss = loss + s.mahalanobis * mahalanobis(values["latent"], self.decoder.codes)
+        loss = loss + s.mahalanobis * self.prior.energy(values["latent"])
         loss = loss + s.anchor * anchor_loss(values, self.anchors) / 10
         return loss + 0.1 * evidence_loss(values, posed, models.body, self.photo, BodyFit())
 

@@ -15,6 +15,7 @@ from pipelines.refine import Refinement, refine
 from pipelines.results import FitResult, write_results
 from pipelines.run import Run
 from recon.files.state import file_digest
+from recon.files.weights import read_manifest
 from recon.types import Mesh, Photo, UserError, to_device
 
 Say = Callable[[str, str, float], None]
@@ -103,8 +104,6 @@ def fit_photo(config: PhotoFit, say: Say | None = None, tick=None) -> FitResult:
 
 def open_run(config: PhotoFit, masks: dict[str, Tensor] | None, say: Say | None) -> Run:
     """The run's folder: its identity is the photo and the garments; masks, person, body and weights are evidence."""
-    from recon.files.weights import manifest_digest
-
     identity = {"photo": file_digest(config.photo), "garments": sorted(config.garments)}
     evidence = {
         "masks": {k: int(v.sum()) for k, v in masks.items()} if masks else {},
@@ -112,7 +111,7 @@ def open_run(config: PhotoFit, masks: dict[str, Tensor] | None, say: Say | None)
         "labels": config.labels,
         "person": config.person,
         "body": [config.body, file_digest(config.body_file) if config.body_file else ""],
-        "weights": manifest_digest(config.weights),
+        "weights": read_manifest(config.weights),
         "seed": config.seed,
         "device": config.device,
     }

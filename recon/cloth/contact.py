@@ -8,6 +8,7 @@ import warp as wp
 from torch import Tensor
 
 wp.config.quiet = True
+wp.init()
 
 REACH = 2.0
 """Closest points are searched for within this distance: more than any body's depth [m]."""
