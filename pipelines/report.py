@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LONGEST = 1000
 """Longer side of photos in the report [px]."""
+SHADED = 720
+"""The same of the shaded picture beside them, whose cost grows with its pixels."""
 
 Picture = NDArray[np.uint8]
 Colour = tuple[float, float, float]
@@ -73,12 +75,13 @@ def write_pictures(result: FitResult) -> Pictures:
     cover = renderer([mesh.vertices for mesh in meshes], result.camera, photo.shape[:2]).cpu().numpy()
     masks = [result.photo.garments[name].cpu().numpy() for name in result.garments]
     overlay = draw_overlay(photo, cover, masks, colours[1:])
-    h, w = (round(side * min(1.0, LONGEST / max(photo.shape[:2]))) for side in photo.shape[:2])
-    seen = picture(meshes, shade, result.camera, (h, w), Look(background=None)).cpu().numpy()
-    around = tuple(view.cpu().numpy() for view in turntable(meshes, shade, 6, (480, 320)))
+    small = _smaller(photo, SHADED)
+    look = Look(samples=4, sky_rays=4)
+    seen = picture(meshes, shade, result.camera, small.shape[:2], replace(look, background=None)).cpu().numpy()
+    around = tuple(view.cpu().numpy() for view in turntable(meshes, shade, 6, (480, 320), look))
     write_whole(result.folder / "overlay.png", _encoded(overlay, ".png"))
     write_whole(result.folder / "turntable.png", _encoded(np.concatenate(around, axis=1), ".png"))
-    return Pictures(_smaller(photo), _smaller(overlay), _over(seen, _smaller(photo)), around)
+    return Pictures(_smaller(photo), _smaller(overlay), _over(seen, small), around)
 
 
 def draw_overlay(
@@ -103,9 +106,9 @@ def _contours(mask: NDArray[np.bool_]) -> Sequence[Any]:
     return cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
 
 
-def _smaller(picture: Picture) -> Picture:
-    """The picture with its longer side at most ``LONGEST``."""
-    scale = LONGEST / max(picture.shape[:2])
+def _smaller(picture: Picture, longest: int = LONGEST) -> Picture:
+    """The picture with its longer side at most ``longest``."""
+    scale = longest / max(picture.shape[:2])
     if scale >= 1.0:
         return picture
     size = round(picture.shape[1] * scale), round(picture.shape[0] * scale)
@@ -256,6 +259,7 @@ body { margin: 2rem auto; max-width: 72rem; padding: 0 1.2rem; font: 15px/1.5 sy
   color: var(--ink); background: var(--paper) }
 h1 { font-size: 1.6rem; margin: 0 0 .5rem } h2 { font-size: 1.1rem; margin: 2.2rem 0 .6rem; display: inline-block }
 p, figcaption { color: var(--dim); margin: .2rem 0 .6rem }
+.row img, .strip img { width: 100% }
 img, svg { max-width: 100%; height: auto; border-radius: 4px }
 figure { margin: 0 } figure svg { border: 1px solid var(--line); margin-bottom: .8rem }
 .row { display: grid; grid-template-columns: repeat(3, 1fr); gap: .8rem }
