@@ -43,6 +43,8 @@ class TrainIsp:
     """Folder for the weights, their manifest, the log and the checkpoints."""
     minutes: float = 20.0
     """Training time [minutes], preparation and evaluation not counted."""
+    steps: int = 0
+    """Train so many steps instead of so many minutes; 0 = by the clock."""
     seed: int = 0
     """Seed of initialisation and sampling."""
     threads: int = 2
@@ -155,15 +157,15 @@ def first_codes(samples: IspSamples, size: int) -> Tensor:
 def _descend(
     state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator, checkpoint: Path
 ) -> None:
-    """Adam along a cosine that follows the time spent."""
+    """Adam along a cosine that follows the time spent (or the steps, if they are fixed)."""
     columns = TextColumn("isp {task.fields[kind]}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
     log = open(config.out / f"isp-{config.kind}.log.jsonl", "a")  # noqa: SIM115
     budget, smooth, saved = config.minutes * 60, {}, state.seconds
     with log, Progress(*columns) as progress:
-        bar = progress.add_task("train", total=budget, kind=config.kind, note="")
-        while state.seconds < budget:
+        bar = progress.add_task("train", total=1.0, kind=config.kind, note="")
+        while (share := state.step / config.steps if config.steps else state.seconds / budget) < 1:
             begun = time.perf_counter()
-            rate = min(1.0, (state.step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * state.seconds / budget) + 2e-3)
+            rate = min(1.0, (state.step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * share) + 2e-3)
             for group, full in zip(state.optimizer.param_groups, (config.rate, config.code_rate), strict=True):
                 group["lr"] = full * rate
             terms = take_step(state, samples, config, generator)
@@ -174,7 +176,7 @@ def _descend(
                 log.write(json.dumps({"step": state.step, "seconds": round(state.seconds, 1), **smooth}) + "\n")
                 log.flush()
                 note = f"step {state.step}  surface {smooth['surface_mm']:.2f} mm  pattern {smooth['pattern_mm']:.2f} mm"
-                progress.update(bar, completed=state.seconds, note=note)
+                progress.update(bar, completed=share, note=note)
             if state.seconds - saved > 60:
                 saved = state.seconds
                 _save(state, checkpoint, config, len(samples))
@@ -298,7 +300,7 @@ def _resume(state: Progressing, path: Path, config: TrainIsp, count: int) -> Non
 
 def _settings(config: TrainIsp, count: int) -> str:
     """What a checkpoint must agree with to go on from it."""
-    free = {"out", "minutes", "threads", "evaluate", "garments"}
+    free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
     return json.dumps({**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True)
 
 

@@ -45,7 +45,7 @@ def grid_axis(resolution: int) -> NDArray[np.float64]:
 def clean_signs(distance: NDArray, cell: float) -> NDArray[np.int8]:
     """Signs (-1 inside, 0 on the border, 1 outside) of a distance grid, without specks.
 
-    Islands below 2 % of the largest piece vanish, holes below (0.04)² of the domain close: neither occurs in a pattern.
+    Islands below 2 % of the largest piece vanish, holes below (0.08)² of the domain close: neither occurs in a pattern.
     """
     sign = np.sign(distance).astype(np.int8)
     sign[np.abs(distance) < SNAP * cell] = 0
@@ -59,7 +59,7 @@ def clean_signs(distance: NDArray, cell: float) -> NDArray[np.int8]:
     holes, count = ndimage.label(sign >= 0, TRIANGLE_NEIGHBOURS)
     if count > 1:
         sizes = np.bincount(holes.ravel())
-        small = sizes < (0.04 / cell) ** 2
+        small = sizes < (0.08 / cell) ** 2
         small[[0, holes[0, 0]]] = False
         sign[small[holes]] = -1
     return sign

@@ -101,11 +101,8 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
         lengths = np.linalg.norm(np.roll(place, -1, 0) - place, axis=1)
         clean = clean_runs(labels[offset : offset + len(loop)], lengths)
         offset += len(loop)
-        changes = np.nonzero(clean != np.roll(clean, 1))[0]
-        if not len(changes):
-            per_point[loop] = 0  # a loop of one label has no partner to be sewn to
-            continue
         per_point[loop] = 0
+        changes = np.nonzero(clean != np.roll(clean, 1))[0]
         corners = [corner_near(place, lengths, int(k)) for k in changes]
         for k, start in enumerate(corners):
             end = corners[(k + 1) % len(corners)]
@@ -114,8 +111,19 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
                 continue
             index = np.arange(start, end + 1 + (len(loop) if end <= start else 0)) % len(loop)
             chains.append(Chain(label, loop[index]))
-            per_point[loop[index]] = label
+    chains = _without_scraps(panel, chains)
+    for chain in chains:
+        per_point[chain.points] = chain.label
     return chains, per_point
+
+
+def _without_scraps(panel: Panel, chains: list[Chain]) -> list[Chain]:
+    """Chains without those far shorter than the longest one of their label: a seam's stray traces around a corner."""
+    length = [np.linalg.norm(np.diff(panel.points[c.points], axis=0), axis=1).sum() for c in chains]
+    longest: dict[int, float] = {}
+    for chain, own in zip(chains, length, strict=True):
+        longest[chain.label] = max(longest.get(chain.label, 0.0), own)
+    return [c for c, own in zip(chains, length, strict=True) if own > 0.25 * longest[c.label]]
 
 
 def arc_lengths(points: NDArray) -> NDArray:

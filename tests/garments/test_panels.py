@@ -1,0 +1,186 @@
+"""Cutting panels out of a grid, and sewing them."""
+
+import numpy as np
+import pytest
+
+from recon.garments.panels import border_loops, cut_panel, grid_axis, move_safely, signed_areas
+from recon.garments.sewing import (
+    arc_lengths,
+    chains_of,
+    clean_runs,
+    garment_loops,
+    is_manifold,
+    merge_parameters,
+    pair_chains,
+    sew,
+    split_chords,
+)
+
+
+def grid(resolution):
+    axis = grid_axis(resolution)
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
+
+
+def box(x, half_width, half_height, centre=(0.0, 0.0)):
+    """Signed distance of a rectangle."""
+    q = np.abs(x - np.array(centre)) - np.array([half_width, half_height])
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def disc(x, radius, centre=(0.0, 0.0)):
+    return np.linalg.norm(x - np.array(centre), axis=-1) - radius
+
+
+@pytest.mark.parametrize("resolution", [24, 33, 64, 128])
+@pytest.mark.parametrize("radius", [0.31, 0.5, 0.77])
+def test_a_disc_is_one_loop_of_decent_triangles(resolution, radius):
+    panel = cut_panel(disc(grid(resolution), radius))
+    areas = signed_areas(panel.points, panel.faces)
+    cell = 2 / resolution
+    assert len(panel.loops) == 1 and is_manifold(panel.faces)
+    assert areas.min() > 0.02 * cell**2
+    assert abs(areas.sum() - np.pi * radius**2) < 3 * cell * radius
+    assert np.abs(np.linalg.norm(panel.points[panel.border], axis=1) - radius).max() < 0.35 * cell
+
+
+def test_every_vertex_is_used_and_borders_run_counter_clockwise():
+    panel = cut_panel(box(grid(50), 0.4, 0.61))
+    assert set(panel.faces.ravel()) == set(range(len(panel.points)))
+    x, y = panel.points[panel.loops[0]].T
+    assert 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() > 0
+
+
+def test_halves_and_holes_stay_while_specks_vanish():
+    x = grid(128)
+    halves = np.minimum(box(x, 0.2, 0.5, (-0.3, 0)), box(x, 0.2, 0.5, (0.3, 0)))
+    ring = np.maximum(disc(x, 0.6), -disc(x, 0.3))
+    speck = np.minimum(ring, disc(x, 0.03, (0.85, 0.85)))
+    pinhole = np.maximum(disc(x, 0.6), -disc(x, 0.02))
+    assert len(cut_panel(halves).loops) == 2
+    assert len(cut_panel(ring).loops) == 2
+    assert len(cut_panel(speck).loops) == 2
+    assert len(cut_panel(pinhole).loops) == 1
+
+
+def test_touching_pieces_are_parted_at_the_pinch():
+    x = grid(32)
+    touching = np.minimum(box(x, 0.25, 0.25, (-0.25, -0.25)), box(x, 0.25, 0.25, (0.25, 0.25)))
+    panel = cut_panel(touching)
+    assert is_manifold(panel.faces)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_shapes_are_manifold(seed):
+    rng = np.random.default_rng(seed)
+    x = grid(40)
+    field = np.minimum.reduce([disc(x, rng.uniform(0.1, 0.4), rng.uniform(-0.5, 0.5, 2)) for _ in range(6)])
+    field = np.maximum(field, -disc(x, rng.uniform(0.05, 0.3), rng.uniform(-0.5, 0.5, 2)))
+    panel = cut_panel(field + 0.01 * rng.normal(size=field.shape))
+    assert is_manifold(panel.faces)
+    assert signed_areas(panel.points, panel.faces).min() > 0
+
+
+def test_moves_that_would_flip_a_triangle_are_held_back():
+    points = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    moved = move_safely(points, faces, np.array([0]), np.array([[2.0, 2.0]]))
+    assert signed_areas(moved, faces).min() > 0
+    free = move_safely(points, faces, np.array([0]), np.array([[0.1, 0.1]]))
+    np.testing.assert_allclose(free[0], [0.1, 0.1])
+
+
+def test_short_label_runs_are_noise():
+    labels = np.array([0] * 20 + [1] * 10 + [2] + [1] * 9 + [0] * 2)
+    clean = clean_runs(labels, np.full(len(labels), 0.01))
+    assert set(clean[20:40]) == {1} and set(clean[:19]) == {0}
+    wrapped = clean_runs(np.roll(labels, 25), np.full(len(labels), 0.01))
+    assert (np.roll(wrapped, -25) == clean).all()
+
+
+def test_arc_lengths_and_their_common_places():
+    a = np.linspace(0, 1, 11)
+    b = np.linspace(0, 1, 12)
+    t, ia, ib = merge_parameters(a, b, 0.04)
+    assert (np.diff(t) > 0).all() and t[0] == 0 and t[-1] == 1
+    assert set(range(11)) <= set(ia) and set(range(12)) <= set(ib)
+    same = merge_parameters(a, a + 0.0, 0.04)
+    assert len(same[0]) == 11 and (same[1] == same[2]).all()
+    np.testing.assert_allclose(arc_lengths(np.array([[0.0, 0], [0, 3], [4, 3]])), [0, 3 / 7, 1])
+
+
+def side_labels(panel):
+    """Left and right sides are seams 2 and 1, top and bottom are open."""
+    p = panel.points[panel.border]
+    half, low, high = np.abs(p[:, 0]).max(), p[:, 1].min(), p[:, 1].max()
+    rim = np.minimum(p[:, 1] - low, high - p[:, 1]) < half - np.abs(p[:, 0])
+    return np.where(rim, 0, np.where(p[:, 0] > 0, 1, 2))
+
+
+@pytest.mark.parametrize(("resolution", "shift"), [(40, 0.0), (40, 0.013), (97, 0.007), (128, -0.01)])
+def test_two_sheets_sewn_at_the_sides_make_a_tube(resolution, shift):
+    front = cut_panel(box(grid(resolution), 0.5, 0.6))
+    back = cut_panel(box(grid(resolution), 0.5 + shift, 0.6 - shift))
+    sewn = sew(front, back, side_labels(front), side_labels(back), 2 / resolution)
+    faces = sewn.vertex_of_point[sewn.faces]
+    assert is_manifold(faces)
+    assert len(garment_loops(faces)) == 2
+    euler = len(np.unique(faces)) - len(np.unique(np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), 1), axis=0)) + len(faces)
+    assert euler == 0
+    assert signed_areas(sewn.points, sewn.faces[sewn.panel_of_face == 0]).min() > 0
+    assert signed_areas(sewn.points, sewn.faces[sewn.panel_of_face == 1]).max() < 0
+    counts = np.bincount(sewn.vertex_of_point)
+    assert counts.max() == 2 and (sewn.labels[counts[sewn.vertex_of_point] == 2] > 0).all()
+    assert (counts[sewn.vertex_of_point[sewn.labels > 0]] == 2).all()
+
+
+def test_an_open_front_gives_three_borders_less_one():
+    """A jacket without sleeves: two front halves, one border running all around."""
+    x = grid(96)
+    front = cut_panel(np.maximum(box(x, 0.5, 0.6), -box(x, 0.04, 2.0)))
+    back = cut_panel(box(x, 0.5, 0.6))
+    sewn = sew(front, back, side_labels(front), side_labels(back), 2 / 96)
+    faces = sewn.vertex_of_point[sewn.faces]
+    assert is_manifold(faces) and len(garment_loops(faces)) == 1
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.08])
+def test_label_noise_does_not_tear_a_seam(noise):
+    rng = np.random.default_rng(3)
+    front, back = cut_panel(box(grid(64), 0.5, 0.6)), cut_panel(box(grid(64), 0.49, 0.6))
+    labels = [side_labels(p) for p in (front, back)]
+    for values in labels:
+        values[rng.random(len(values)) < noise] = rng.integers(3)
+    sewn = sew(front, back, *labels, 2 / 64)
+    faces = sewn.vertex_of_point[sewn.faces]
+    assert is_manifold(faces) and len(garment_loops(faces)) == 2
+
+
+def test_a_seam_without_partner_stays_open():
+    front, back = cut_panel(box(grid(64), 0.5, 0.6)), cut_panel(box(grid(64), 0.5, 0.6))
+    one_sided = side_labels(back)
+    one_sided[one_sided == 1] = 0
+    sewn = sew(front, back, side_labels(front), one_sided, 2 / 64)
+    faces = sewn.vertex_of_point[sewn.faces]
+    assert is_manifold(faces) and len(garment_loops(faces)) == 1
+    assert not (sewn.labels == 1).any()
+
+
+def test_chords_between_seam_points_are_split():
+    points = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    p, f, labels = split_chords(points, faces, np.array([1, 0, 1, 0]))
+    assert len(f) == 4 and len(p) == 5 and labels[4] == -1
+    np.testing.assert_allclose(signed_areas(p, f), 0.25)
+    assert len(border_loops(f)) == 1
+
+
+def test_chains_pair_by_label_and_place():
+    front = cut_panel(box(grid(64), 0.5, 0.6))
+    chains, labels = chains_of(front, side_labels(front))
+    assert sorted(c.label for c in chains) == [1, 2]
+    pairs = pair_chains(front, front, chains, chains)
+    assert all((a.points == b.points).all() for a, b in pairs)
+    ends = front.points[[chains[0].points[0], chains[0].points[-1]]]
+    np.testing.assert_allclose(np.abs(ends), [[0.5, 0.6]] * 2, atol=0.05)
+    assert (labels[front.border] >= 0).all()
