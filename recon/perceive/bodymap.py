@@ -24,6 +24,8 @@ class BodyMap:
     """(h, w) signed distance from the trunk's middle line in half trunk widths: +-1 on the lines shoulder to hip."""
     arm: np.ndarray
     """(h, w) place along the nearest arm: 0 shoulder, 1 elbow, 2 wrist, more on the hand."""
+    arm_axis: np.ndarray
+    """(h, w) distance to the nearest arm's axis in its radii, below 1 on a bare arm, also where it is before the trunk."""
     leg: np.ndarray
     """(h, w) place along the nearest leg: 0 hip, 1 knee, 2 ankle, more on the foot."""
     hand: np.ndarray
@@ -34,6 +36,8 @@ class BodyMap:
     """(h, w) distance to the face's centre in head radii, below 1 on the head."""
     neck: np.ndarray
     """(h, w) distance to the base of the neck in shoulder widths."""
+    beside: np.ndarray
+    """(h, w) bool, beside jaw and neck: only long hair, a hood or a scarf is there."""
     chin: float
     """Height of the chin, in ``up``."""
     unit: float
@@ -124,6 +128,9 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     def mix(a: int, b: int, t: float) -> np.ndarray:
         return p[a] + t * (p[b] - p[a])
 
+    aside = np.abs((grid - centre) @ np.array([-axis[1], axis[0]]))
+    beside = (up < chin + 0.2) & (up > chin - 0.12) & (aside > 0.6 * ear) & (aside < 1.5 * ear)
+
     core = _polygon(shape, np.array([mix(11, 23, 0.2), mix(12, 24, 0.2), mix(23, 11, 0.25), mix(24, 12, 0.25)]))
     core &= np.abs(across) < 0.85
     thighs = np.zeros(shape, bool)
@@ -131,9 +138,9 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
         d, t = _segment(grid, p[a], p[b])
         thighs |= (d < 0.13 * width) & (t > 0.15) & (t < 0.7)
     return BodyMap(
-        part=part, up=up, across=across, arm=pick(arms), leg=pick(legs), hand=hand, foot=foot, head=head,
+        part=part, up=up, across=across, arm=pick(arms), arm_axis=np.minimum(*(d for d, _ in arms.values())), leg=pick(legs), hand=hand, foot=foot, head=head,
         neck=np.linalg.norm(grid - p[11:13].mean(0) - 0.12 * unit * axis, axis=-1) / width,
-        chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
+        beside=beside, chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
     )  # fmt: skip
 
 

@@ -101,7 +101,9 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
     for k in range(ROUNDS):
         colour = _colour(colours, samples, first=k == 0)
         ends = find_ends(colour, inner, body, outfit)
-        belief = smooth(rgb, colour + place(body, outfit, ends), person)
+        energy = colour + place(body, outfit, ends)
+        energy[..., HAIR] -= np.where(long_hair(colour, inner, body), 0, _past(body.chin + 0.05 - body.up, 60, 12))
+        belief = smooth(rgb, energy, person)
         best, sure = belief.argmax(-1), (belief.max(-1) > 0.85) & inner
         samples = {n: np.vstack([x, *[colours[sure & (best == n)]] * 2]) for n, x in seeds.items()}
     return Parsed(belief, colour, ends)
@@ -185,6 +187,13 @@ def find_ends(colour: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Out
     return ends
 
 
+def long_hair(colour: np.ndarray, person: np.ndarray, body: BodyMap) -> bool:
+    """Whether the hair falls below the chin: it then shows beside the jaw (a hood there has another colour)."""
+    beside = body.beside & person & (body.part != TORSO)
+    hair = colour[..., HAIR] > colour[..., [JACKET, TOP, SKIN]].max(-1)
+    return bool((hair & beside).sum() > max(0.4 * beside.sum(), 0.0008 * person.sum()))
+
+
 def _past(z: np.ndarray, slope: float, most: float) -> np.ndarray:
     """Cost that grows with the way ``z`` past an end, at most ``most``."""
     return np.clip(slope * np.clip(z, -1e3, 1e3), 0, most)
@@ -212,7 +221,7 @@ def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
             out[..., layer] = NEVER
     if JACKET in outfit.zones:
         out[..., TOP] -= np.where(arm, 8, 0) + _past(np.abs(body.across) - 0.45, 14, 8)
-        out[..., JACKET] -= _past(0.35 - np.abs(body.across), 4, 1) + _past(0.28 - body.neck, 30, 6)
+        out[..., JACKET] -= _past(0.35 - np.abs(body.across), 4, 1) + _past(0.16 - body.neck, 30, 6)
     if outfit.dress:
         out[..., LOWER] = NEVER
     else:
@@ -243,6 +252,12 @@ def _skin_cost(
     cost = np.minimum(cost, _past(body.head - 1.0, 8, 12))
     neckline = 0.2 if JACKET in outfit.zones else 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
     cost = np.minimum(cost, _past(body.neck - neckline, 25, 12))
+    # A bare arm may be in front of the trunk; there the colour decides.
+    arm_end = np.where(body.across > 0, ends.sleeve[ARM_L], ends.sleeve[ARM_R])
+    in_front = 1.5 + _past(body.arm_axis - 1.0, 16, 12) + _past(arm_end + 0.15 - body.arm, 25, 12)
+    cost = np.minimum(cost, np.where(body.part == TORSO, in_front, 12))
+    if outfit.zones[TOP].sleeve.high < 0.5:  # straps leave shoulders and shoulder blades bare
+        cost = np.minimum(cost, 2.5 + _past(0.45 - body.up, 25, 12))
     if ends.upper > ends.lower:
         bared = np.maximum(body.up - ends.upper, ends.lower - body.up)
         cost = np.minimum(cost, np.where(arm, cost, _past(bared, 25, 12)))
