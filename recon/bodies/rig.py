@@ -5,6 +5,9 @@ World-aligned axes: in the T pose (all zeros) every joint's local frame equals t
 
 from __future__ import annotations
 
+from functools import lru_cache
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -55,23 +58,33 @@ def axis_angles(rotations: Tensor) -> Tensor:
     return torch.where(norm < 1e-9, 2 * q[..., 1:], q[..., 1:] / norm.clamp_min(1e-12) * angle)
 
 
+@lru_cache(maxsize=8)
+def _generations(parents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], ...], tuple[int, ...]]:
+    """Joints by their distance from the root, and each joint's place in the list of all generations."""
+    depth = [0] * len(parents)
+    for j, p in enumerate(parents):
+        depth[j] = 0 if p < 0 else depth[p] + 1
+    rows = tuple(tuple(j for j in range(len(parents)) if depth[j] == d) for d in range(max(depth) + 1))
+    order = [j for row in rows for j in row]
+    return rows, tuple(order.index(j) for j in range(len(parents)))
+
+
 def chain(pose: Tensor, joints: Tensor, parents: tuple[int, ...] = PARENTS) -> tuple[Tensor, Tensor]:
-    """Forward kinematics with world-aligned axes.
+    """Forward kinematics with world-aligned axes, a generation of joints at a time.
 
     pose (B, J, 3) local axis-angle, joints (B, J, 3) rest joints -> world rotations (B, J, 3, 3), posed joints
     (B, J, 3); the first joint stays where the rest body has it.
     """
-    local = rotation_matrices(pose)
-    world: list[Tensor] = []
-    posed: list[Tensor] = []
-    for j, p in enumerate(parents):
-        if p < 0:
-            world.append(local[:, j])
-            posed.append(joints[:, j])
-        else:
-            world.append(world[p] @ local[:, j])
-            posed.append(posed[p] + (world[p] @ (joints[:, j] - joints[:, p])[..., None])[..., 0])
-    return torch.stack(world, 1), torch.stack(posed, 1)
+    rows, place = _generations(tuple(parents))
+    step = torch.cat([joints[:, :1], joints[:, 1:] - joints[:, list(parents[1:])]], 1)
+    local = torch.cat([rotation_matrices(pose), step[..., None]], -1)  # (B, J, 3, 4)
+    world = [local[:, list(rows[0])]]
+    for above, row in pairwise(rows):
+        up = world[-1][:, [above.index(parents[j]) for j in row]]
+        turned = up[..., :3] @ local[:, list(row)]
+        world.append(torch.cat([turned[..., :3], turned[..., 3:] + up[..., 3:]], -1))
+    whole = torch.cat(world, 1)[:, list(place)]
+    return whole[..., :3], whole[..., 3]
 
 
 def joint_transforms(pose: Tensor, joints: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
