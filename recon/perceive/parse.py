@@ -99,7 +99,7 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
     seeds = _seeds(colours, inner, body, outfit)
     samples = seeds
     for k in range(ROUNDS):
-        colour = _colour(colours, samples, first=k == 0)
+        colour = _colour(colours, person, samples, first=k == 0)
         ends = find_ends(colour, inner, body, outfit)
         energy = colour + place(body, outfit, ends)
         energy[..., HAIR] -= np.where(long_hair(colour, inner, body), 0, _past(body.chin + 0.05 - body.up, 60, 12))
@@ -144,12 +144,12 @@ def _jacket_seeds(
     return {JACKET: jacket, TOP: strange}
 
 
-def _colour(colours: np.ndarray, samples: dict[int, np.ndarray], first: bool) -> np.ndarray:
-    """(h, w, LAYERS) log-likelihoods of the colours; layers without samples are never likely."""
+def _colour(colours: np.ndarray, person: np.ndarray, samples: dict[int, np.ndarray], first: bool) -> np.ndarray:
+    """(h, w, LAYERS) log-likelihoods of the person's colours; layers without samples are never likely."""
     out = np.full((*colours.shape[:2], LAYERS), NEVER, np.float32)
     for layer, x in samples.items():
         spread = SHADED if layer == SKIN and first else SPREAD
-        out[..., layer] = fit_mixture(x, 2 if layer == HAIR else 4, spread).log_likelihood(colours)
+        out[person, layer] = fit_mixture(x, 2 if layer == HAIR else 4, spread).log_likelihood(colours[person])
     return out
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-LONG_SIDE = 640
+LONG_SIDE = 512
 """Longer side of the person's window while it is taken apart [px]; borders are sharpened on the photo's own pixels."""
 
 
