@@ -20,7 +20,7 @@ from torch import Tensor
 from recon.types import UserError
 
 LLVM_PACKAGE = "karellen-llvm-core"
-HOW_TO = f"pip install {LLVM_PACKAGE} wheel-axle-runtime (or set DRJIT_LIBLLVM_PATH to a libLLVM of version 17 or newer)"
+HOW_TO = f"pip install {LLVM_PACKAGE} wheel-axle-runtime (or set DRJIT_LIBLLVM_PATH to libLLVM 17 or newer)"
 
 
 def find_llvm() -> Path | None:

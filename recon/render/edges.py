@@ -1,7 +1,7 @@
 """Edges at which an image can jump, and points on them: the geometry of edge-sampled gradients.
 
-The image of opaque triangles is discontinuous only where the projection of an open border lies, or of a fold: an edge with
-both of its faces on one side of it. Which of these are seen, and what is seen on their two sides, rays decide.
+The image of opaque triangles is discontinuous only where the projection of an open border lies, or of a fold: an edge
+with both of its faces on one side of it. Which of these are seen, and what is seen on their two sides, rays decide.
 (Li et al. 2018, "Differentiable Monte Carlo Ray Tracing through Edge Sampling", for a pinhole and constant labels.)
 """
 
@@ -43,7 +43,7 @@ _known: OrderedDict[tuple[bytes, str], Topology] = OrderedDict()
 def topology(faces: Tensor) -> Topology:
     """The edges of (F, 3) faces. The last 16 meshes are remembered by content, so unchanged meshes cost a hash."""
     array = np.ascontiguousarray(faces.detach().cpu().numpy().astype(np.int64, copy=False))
-    key = (hashlib.sha1(array).digest() + len(array).to_bytes(8, "little"), str(faces.device))
+    key = (hashlib.sha1(array.data).digest() + len(array).to_bytes(8, "little"), str(faces.device))
     if key not in _known:
         _known[key] = _build(array, faces.device)
         while len(_known) > 16:
@@ -62,12 +62,10 @@ def _build(faces: np.ndarray, device: torch.device) -> Topology:
     count = np.diff(np.r_[first, len(low)])
     second = np.where(count > 1, first + 1, first) if len(low) else first
     flipped = (count == 2) & (forward[first] == forward[second])
-    tensors = [
-        torch.from_numpy(a).to(device)
-        for a in (np.stack([low[first], high[first]], 1), np.stack([owner[first], owner[second]], 1), count != 2, flipped)
-    ]
+    edges, sides = np.stack([low[first], high[first]], 1), np.stack([owner[first], owner[second]], 1)
+    edges_at, sides_at, always, turned = (torch.from_numpy(a).to(device) for a in (edges, sides, count != 2, flipped))
     closed = len(faces) > 0 and not bool((count != 2).any() or flipped.any())
-    return Topology(*tensors, closed)
+    return Topology(edges_at, sides_at, always, turned, closed)
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,10 @@ def edge_points(points: Tensor, edges: Tensor, size: tuple[int, int], step: floa
 
 
 def _clip(image: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Liang and Barsky 1984: the stretch [start, stop] of each segment (E, 2, 2) that lies in the image (start = stop: none)."""
+    """The stretch [start, stop] of each segment (E, 2, 2) that lies in the image; start = stop: none.
+
+    Liang and Barsky 1984.
+    """
     half = image.new_tensor([size[1] / 2, size[0] / 2])
     origin, direction = image[:, 0], image[:, 1] - image[:, 0]
     safe = torch.where(direction == 0, torch.full_like(direction, 1e-30), direction)

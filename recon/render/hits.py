@@ -71,7 +71,7 @@ def first_hit(
     """What each of (h, w) pixels sees first, of the whole image or of a window of it (original pixels)."""
     view = view_of(camera, size, window)
     merged = merge(meshes)
-    hits = scene_of(merged, view).hits(view.grid(1, merged.vertices.device))
+    hits = scene_of(merged, view).hits(view.grid(1))
     seen = hits.face >= 0
     mesh = torch.where(seen, merged.mesh_of_face[hits.face.clamp_min(0)], -1)
     face = torch.where(seen, hits.face - merged.first_face[mesh.clamp_min(0)], -1)

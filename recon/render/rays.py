@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.render import backend
+from recon.render.view import Grid
 
 
 @dataclass(frozen=True)
@@ -27,8 +28,8 @@ class Hits:
 class RayScene:
     """One Mitsuba scene with one mesh, whose vertices and faces are set anew before each use.
 
-    Setting costs one build of the ray structure (about 2.3 µs of CPU time a triangle, in parallel over cores) whether faces
-    change or not; making another scene costs the same and leaks registry entries, so there is one scene per device.
+    Setting costs one build of the ray structure (about 2 µs of CPU time a triangle, in parallel over cores), whether
+    faces change or not. There is one scene per device.
     """
 
     def __init__(self, device: torch.device):
@@ -42,6 +43,7 @@ class RayScene:
         self._scene: Any = mi.load_dict({"type": "scene", "merged": mesh}, parallel=False)
         self._params: Any = mi.traverse(self._scene)
         self._empty = True
+        self._grids: dict[Grid, Any] = {}  # the last images' rays
 
     def set(self, vertices: Tensor, faces: Tensor) -> None:
         """Trace against these from now on. vertices (V, 3) float, faces (F, 3) int; F = 0 is an empty scene."""
@@ -53,8 +55,11 @@ class RayScene:
         self._params["merged.faces"] = backend.to_dr(mi.UInt32, faces.to(torch.int32))
         self._params.update()
 
-    def values(self, directions: Tensor, value_of_face: Tensor) -> Tensor:
-        """What rays from the origin see: (N, 2) slopes u, v of rays (u, v, 1) and (F,) integers >= 0 -> (N,) int32, 0 = nothing."""
+    def values(self, directions: Tensor | Grid, value_of_face: Tensor) -> Tensor:
+        """What rays (u, v, 1) from the origin see: (F,) integers > 0 -> (N,) int32, 0 = nothing.
+
+        directions: (N, 2) slopes u, v, or a whole image's.
+        """
         if self._empty or len(directions) == 0:
             return torch.zeros(len(directions), dtype=torch.int32, device=self.device)
         mi, dr = backend.load(self.device)
@@ -63,12 +68,13 @@ class RayScene:
         seen = hit.is_valid()
         return backend.to_torch(dr.select(seen, dr.gather(mi.UInt32, table, hit.prim_index, seen), 0), self.device)
 
-    def hits(self, directions: Tensor) -> Hits:
-        """Faces, barycentrics and depths that rays (u, v, 1) from the origin first hit; directions (N, 2)."""
+    def hits(self, directions: Tensor | Grid) -> Hits:
+        """Faces, barycentrics and depths that rays (u, v, 1) from the origin first hit; directions as in ``values``."""
         if self._empty or len(directions) == 0:
-            n, float32 = len(directions), dict(dtype=torch.float32, device=self.device)
+            n = len(directions)
             nothing = torch.full((n,), -1, dtype=torch.long, device=self.device)
-            return Hits(nothing, torch.zeros(n, 2, **float32), torch.full((n,), torch.inf, **float32))
+            far = torch.full((n,), torch.inf, device=self.device)
+            return Hits(nothing, torch.zeros(n, 2, device=self.device), far)
         mi, dr = backend.load(self.device)
         hit = self._trace(mi.Point3f(0), self._slopes(directions))
         seen = hit.is_valid()
@@ -97,9 +103,15 @@ class RayScene:
         mi, _ = backend.load(self.device)
         return [backend.to_dr(mi.Float, column) for column in rows.float().T.contiguous()]
 
-    def _slopes(self, directions: Tensor):
+    def _slopes(self, directions: Tensor | Grid):
         mi, _ = backend.load(self.device)
-        return mi.Vector3f(*self._columns(directions), 1)
+        if not isinstance(directions, Grid):
+            return mi.Vector3f(*self._columns(directions), 1)
+        if directions not in self._grids:
+            self._grids = dict(list(self._grids.items())[-7:])
+            columns = directions.slopes().to(self.device).T.contiguous()
+            self._grids[directions] = mi.Vector3f(*(backend.to_dr(mi.Float, column) for column in columns), 1)
+        return self._grids[directions]
 
 
 @cache

@@ -61,7 +61,7 @@ def picture(
     grid = math.isqrt(look.samples)
     view, merged = view_of(camera, size), merge(meshes)
     scene = scene_of(merged, view)
-    hits = scene.hits(view.grid(grid, merged.vertices.device))
+    hits = scene.hits(view.grid(grid))
     rows = torch.nonzero(hits.face >= 0)[:, 0]
     surface = _surface(merged, hits.face[rows], hits.uv[rows], camera)
     light = _light(scene, view, surface, camera, look)
@@ -70,7 +70,7 @@ def picture(
     fine = light.new_zeros(len(hits.face), 4)
     fine[rows] = torch.cat([albedo * tone * light[:, None], torch.ones_like(light)[:, None]], 1)
     h, w = view.size
-    return _develop(fine.reshape(h, grid, w, grid, 4).mean((1, 3)), look.background)
+    return _develop(fine.reshape(grid**2, h, w, 4).mean(0), look.background)
 
 
 def orbit_camera(
@@ -185,7 +185,7 @@ def _shifted(i: int, n: int, turn: Tensor) -> Tensor:
 
 
 def _cosine_direction(normal: Tensor, square: Tensor) -> Tensor:
-    """(N, 3) directions around normals with density cosine / pi, from (N, 2) points of the unit square (Malley's method)."""
+    """(N, 3) directions around normals with density cosine / pi, from (N, 2) points of the unit square (Malley)."""
     radius, angle = square[:, 0].sqrt(), 2 * math.pi * square[:, 1]
     sign = torch.where(normal[:, 2] < 0, -1.0, 1.0)  # a frame without branches: Duff et al. 2017
     a = -1.0 / (sign + normal[:, 2])

@@ -1,6 +1,6 @@
 """From world points to homogeneous image points: the space that all rays are traced in.
 
-A pinhole image of x = K (R X + t) depends on x alone, and x ↦ x_xy / x_z keeps straight lines, occlusion order and depth
+A pinhole image depends on x = K (R X + t) alone, and x ↦ x_xy / x_z keeps straight lines, occlusion order and depth
 (x_z is the depth itself). So every renderer here moves the *vertices* by K, R and t, differentiably in torch, and then
 looks at them with one fixed camera: rays (u, v, 1) from the origin. Gradients with respect to focal length, principal
 point, rotation and translation need no code of their own.
@@ -20,6 +20,29 @@ NEAR = 1e-3
 
 Window = tuple[float, float, float, float]
 """x0, y0, x1, y1 in pixels of the original image; pixel (row i, column j) covers [j, j + 1) x [i, i + 1)."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Rays (u, v, 1) through n x n places in each pixel, as n x n whole images one after the other: (n n, h, w)."""
+
+    size: tuple[int, int]
+    """(h, w) pixels."""
+    n: int
+    scale: float
+    """Pixels per unit of slope."""
+
+    def __len__(self) -> int:
+        return self.size[0] * self.size[1] * self.n**2
+
+    def slopes(self) -> Tensor:
+        """(n n h w, 2) the rays' u and v."""
+        n = self.n
+        v, u = ((torch.arange(m * n) + 0.5).div(n).sub(m / 2).div(self.scale).reshape(m, n).T for m in self.size)
+        h, w = self.size
+        rows = v[:, None, :, None].expand(n, n, h, w)
+        columns = u[None, :, None, :].expand(n, n, h, w)
+        return torch.stack([columns.reshape(-1), rows.reshape(-1)], 1)
 
 
 @dataclass(frozen=True)
@@ -53,11 +76,9 @@ class View:
         """(N, 3) homogeneous image points or directions, scaled to the traced space."""
         return points / points.new_tensor([self.scale, self.scale, 1.0])
 
-    def grid(self, n: int, device: torch.device) -> Tensor:
-        """(h n w n, 2) slopes of the rays through a regular n x n grid in each pixel, row by row of the finer image."""
-        centres = [((torch.arange(m * n, device=device) + 0.5) / n - m / 2) / self.scale for m in self.size]
-        v, u = torch.meshgrid(*centres, indexing="ij")
-        return torch.stack([u.reshape(-1), v.reshape(-1)], 1)
+    def grid(self, n: int) -> Grid:
+        """The rays of a regular n x n grid in each pixel."""
+        return Grid(self.size, n, self.scale)
 
 
 def view_of(camera: Camera, size: tuple[int, int] | None = None, window: Window | None = None) -> View:
@@ -78,7 +99,8 @@ def view_of(camera: Camera, size: tuple[int, int] | None = None, window: Window 
 def outcodes(points: Tensor, size: tuple[int, int]) -> Tensor:
     """(V,) uint8, one bit per half space of the image that a homogeneous point lies outside of.
 
-    Left, right, top, bottom, behind. A face or an edge whose corners share a bit can't be seen. Holds for points behind the camera as well.
+    Left, right, top, bottom, behind. A face or an edge whose corners share a bit can't be seen. Holds for points behind
+    the camera as well.
     """
     h, w = size
     x, y, z = points.unbind(1)
