@@ -38,6 +38,8 @@ class BodyMap:
     """(h, w) distance to the base of the neck in shoulder widths."""
     beside: np.ndarray
     """(h, w) bool, beside jaw and neck: only long hair, a hood or a scarf is there."""
+    gap: np.ndarray
+    """(h, w) distance to the nearest part in its own radii: large where the background may show between limbs."""
     chin: float
     """Height of the chin, in ``up``."""
     unit: float
@@ -140,7 +142,7 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     return BodyMap(
         part=part, up=up, across=across, arm=pick(arms), arm_axis=np.minimum(*(d for d, _ in arms.values())), leg=pick(legs), hand=hand, foot=foot, head=head,
         neck=np.linalg.norm(grid - p[11:13].mean(0) - 0.12 * unit * axis, axis=-1) / width,
-        beside=beside, chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
+        beside=beside, gap=np.min(np.stack(near, -1), -1), chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
     )  # fmt: skip
 
 

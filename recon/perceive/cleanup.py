@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from recon.perceive.segment import Window, guided
-from recon.perceive.zones import JACKET, LAYERS, LOWER, TOP
+from recon.perceive.zones import BACKGROUND, JACKET, LAYERS, LOWER, TOP
 
 NOBODY = 255
 """Label of pixels outside of the person."""
@@ -42,6 +42,7 @@ def sharpen(image: np.ndarray, window: Window, soft: np.ndarray, belief: np.ndar
     if window.scale < 1:
         layers = guided(guide, layers, radius, 1e-4)
     labels = np.array(alive, np.uint8)[layers.argmax(-1)]
+    person[labels == BACKGROUND] = np.minimum(person, 0.3)[labels == BACKGROUND]
     labels[person <= 0.5] = NOBODY
     return person, labels
 

@@ -18,13 +18,15 @@ import numpy as np
 from recon.perceive.bodymap import ARM_L, ARM_R, HEAD, LEG_L, LEG_R, TORSO, BodyMap
 from recon.perceive.colours import FLOOR, SHADED, SPREAD, fit_mixture, lab
 from recon.perceive.segment import guided
-from recon.perceive.zones import HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, limb_ends, waist_split
+from recon.perceive.zones import BACKGROUND, HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, limb_ends, waist_split
 
-MESSAGE = 6.0
+MESSAGE = 4.0
 """Weight of the neighbours' opinion against a pixel's own log-likelihoods."""
 ROUNDS, STEPS = 2, 4
 NEVER = -60.0
 """Energy of a layer that cannot be here."""
+COMPONENTS = {HAIR: 2, BACKGROUND: 6}
+"""Components of a layer's colour mixture, where not 4."""
 MIN_SEED = 40
 """Fewer pixels teach no colour."""
 
@@ -96,7 +98,7 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
     """
     colours = lab(rgb)
     inner = cv2.erode(person.astype(np.uint8), np.ones((3, 3))) > 0
-    seeds = _seeds(colours, inner, body, outfit)
+    seeds = _seeds(colours, inner, body, outfit) | _background(colours, person, body)
     samples = seeds
     for k in range(ROUNDS):
         colour = _colour(colours, person, samples, first=k == 0)
@@ -105,7 +107,8 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
         energy[..., HAIR] -= np.where(long_hair(colour, inner, body), 0, _past(body.chin + 0.05 - body.up, 60, 12))
         belief = smooth(rgb, energy, person)
         best, sure = belief.argmax(-1), (belief.max(-1) > 0.85) & inner
-        samples = {n: np.vstack([x, *[colours[sure & (best == n)]] * 2]) for n, x in seeds.items()}
+        samples = {n: np.vstack([x, *[colours[sure & (best == n)]] * 2]) for n, x in seeds.items() if n != BACKGROUND}
+        samples |= {BACKGROUND: seeds[BACKGROUND]} if BACKGROUND in seeds else {}
     return Parsed(belief, colour, ends)
 
 
@@ -129,6 +132,14 @@ def _seeds(colours: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfi
     return {k: colours[m] for k, m in pick.items() if m.sum() >= MIN_SEED}
 
 
+def _background(colours: np.ndarray, person: np.ndarray, body: BodyMap) -> dict[int, np.ndarray]:
+    """Colours of the ring round trunk and limbs: what may show through between them."""
+    reach = np.ones((2 * round(0.35 * body.width) + 1,) * 2, np.uint8)
+    near = cv2.dilate((person & (body.part != HEAD)).astype(np.uint8), reach) > 0
+    ring = near & ~(cv2.dilate(person.astype(np.uint8), np.ones((5, 5))) > 0)
+    return {BACKGROUND: colours[ring]} if ring.sum() >= MIN_SEED else {}
+
+
 def _jacket_seeds(
     colours: np.ndarray, person: np.ndarray, body: BodyMap, like_face: np.ndarray
 ) -> dict[int, np.ndarray]:
@@ -149,7 +160,7 @@ def _colour(colours: np.ndarray, person: np.ndarray, samples: dict[int, np.ndarr
     out = np.full((*colours.shape[:2], LAYERS), NEVER, np.float32)
     for layer, x in samples.items():
         spread = SHADED if layer == SKIN and first else SPREAD
-        out[person, layer] = fit_mixture(x, 2 if layer == HAIR else 4, spread).log_likelihood(colours[person])
+        out[person, layer] = fit_mixture(x, COMPONENTS.get(layer, 4), spread).log_likelihood(colours[person])
     return out
 
 
@@ -232,6 +243,8 @@ def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
     out[..., HAIR] -= _past(body.head - 1.2, 5, 14) + np.where(arm | leg, 4, 0) + np.where(body.face, 3, 0)
     out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), np.float32(20))
     out[..., SHOE] -= np.minimum(_past(body.foot - 1.0, 4, 8), np.where(past_hem > 0, 2, 8))
+    # The person's mask closes narrow gaps: between the legs, between arm and trunk.
+    out[..., BACKGROUND] -= 1.5 + _past(0.7 - body.gap, 12, 12)
     return out
 
 
@@ -251,7 +264,7 @@ def _skin_cost(
     cost = np.minimum(cost, _past(body.hand - 0.9, 8, 12))
     cost = np.minimum(cost, _past(body.head - 1.0, 8, 12))
     neckline = 0.2 if JACKET in outfit.zones else 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
-    cost = np.minimum(cost, _past(body.neck - neckline, 25, 12))
+    cost = np.minimum(cost, np.minimum(_past(body.neck - 0.1, 5, 12) + _past(body.neck - neckline, 25, 12), 12))
     # A bare arm may be in front of the trunk; there the colour decides.
     arm_end = np.where(body.across > 0, ends.sleeve[ARM_L], ends.sleeve[ARM_R])
     in_front = 1.5 + _past(body.arm_axis - 1.0, 16, 12) + _past(arm_end + 0.15 - body.arm, 25, 12)

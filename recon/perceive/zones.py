@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-JACKET, TOP, LOWER, SKIN, HAIR, SHOE, OTHER = range(7)
+JACKET, TOP, LOWER, SKIN, HAIR, SHOE, BACKGROUND = range(7)
 LAYERS = 7
 
 BIN = 0.04
