@@ -40,6 +40,8 @@ class BodyMap:
     """(h, w) bool, beside jaw and neck: only long hair, a hood or a scarf is there."""
     gap: np.ndarray
     """(h, w) distance to the nearest part in its own radii: large where the background may show between limbs."""
+    behind: bool
+    """Whether the person is seen from behind: the left shoulder is on the photo's left."""
     chin: float
     """Height of the chin, in ``up``."""
     unit: float
@@ -142,7 +144,7 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     return BodyMap(
         part=part, up=up, across=across, arm=pick(arms), arm_axis=np.minimum(*(d for d, _ in arms.values())), leg=pick(legs), hand=hand, foot=foot, head=head,
         neck=np.linalg.norm(grid - p[11:13].mean(0) - 0.12 * unit * axis, axis=-1) / width,
-        beside=beside, gap=np.min(np.stack(near, -1), -1), chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
+        beside=beside, gap=np.min(np.stack(near, -1), -1), behind=bool(p[11, 0] < p[12, 0]), chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
     )  # fmt: skip
 
 

@@ -114,7 +114,10 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
 
 def _seeds(colours: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) -> dict[int, np.ndarray]:
     """Layer -> (N, 3) colours at places where the pose makes the layer near certain."""
-    face = next(m for m in (body.cheeks & person, body.face & person, (body.head < 0.5) & person, person) if m.sum() > MIN_SEED)
+    places = (body.cheeks & person, body.face & person, (body.head < 0.5) & person, person)
+    face = next((m for m in places if m.sum() > MIN_SEED), person)
+    bare = _bare_limbs(body, outfit) & person
+    face = bare if body.behind and bare.sum() > MIN_SEED else face
     skin = fit_mixture(colours[face], 2, SHADED).log_likelihood(colours)
     like_face = skin > np.percentile(skin[face], 10) - 1
     unlike_face = skin < np.percentile(skin[face], 3) - 2
@@ -130,6 +133,17 @@ def _seeds(colours: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfi
     if JACKET in outfit.zones:
         pick |= _jacket_seeds(colours, person, body, like_face)
     return {k: colours[m] for k, m in pick.items() if m.sum() >= MIN_SEED}
+
+
+def _bare_limbs(body: BodyMap, outfit: Outfit) -> np.ndarray:
+    """(h, w) bool: arms and shins that a garment of the named kind cannot cover: skin that shows from behind, too."""
+    sleeve = outfit.zones.get(JACKET, outfit.zones[TOP]).sleeve.high
+    arm = ((body.part == ARM_L) | (body.part == ARM_R)) & (body.arm_axis < 0.6)
+    out = arm & (body.arm > sleeve + 0.25) & (body.arm < 1.9)
+    if not outfit.dress and LOWER in outfit.names:
+        leg = ((body.part == LEG_L) | (body.part == LEG_R)) & (body.gap < 0.5)
+        out |= leg & (body.leg > outfit.zones[LOWER].hem.high + 0.1) & (body.leg < 1.65)
+    return out
 
 
 def _background(colours: np.ndarray, person: np.ndarray, body: BodyMap) -> dict[int, np.ndarray]:
@@ -244,7 +258,7 @@ def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
     out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), np.float32(20))
     out[..., SHOE] -= np.minimum(_past(body.foot - 1.0, 4, 8), np.where(past_hem > 0, 2, 8))
     # The person's mask closes narrow gaps: between the legs, between arm and trunk.
-    out[..., BACKGROUND] -= 1.5 + _past(0.7 - body.gap, 12, 12)
+    out[..., BACKGROUND] -= 1.5 + _past(0.7 - body.gap, 12, 12) + _past(0.8 - body.neck, 20, 12)
     return out
 
 
