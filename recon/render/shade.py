@@ -11,7 +11,7 @@ from torch import Tensor
 
 from recon.render.hits import Merged, merge, scene_of
 from recon.render.rays import RayScene
-from recon.render.view import View, view_of
+from recon.render.view import Grid, View, view_of
 from recon.types import Camera, Mesh
 
 Colour = tuple[float, float, float] | Tensor
@@ -30,15 +30,15 @@ class Look:
     """Rays to the sky per camera ray: smoother shade in folds, slower."""
     lamp_rays: int = 2
     """Rays to the lamp per camera ray: smoother shadow borders, slower."""
-    lamp: tuple[float, float, float] = (-0.55, 0.75, 0.8)
+    lamp: tuple[float, float, float] = (-0.85, 0.75, 0.55)
     """Direction to the lamp, seen from the camera: right, up, towards the camera."""
     lamp_radius: float = 0.25
     """Half width of the lamp at distance one: larger = softer shadows."""
-    lamp_light: float = 0.62
-    """Strength of the lamp; with ``sky_light`` about 1 for a white surface that faces both."""
+    lamp_light: float = 0.95
+    """Strength of the lamp; with ``sky_light`` about 1.3 for a surface that faces both: whites may clip."""
     sky_light: float = 0.55
     """Strength of the sky."""
-    ground_light: float = 0.3
+    ground_light: float = 0.28
     """Strength of the light from below."""
     inside: float = 0.7
     """Brightness of surfaces seen from their inner side."""
@@ -64,7 +64,7 @@ def picture(
     hits = scene.hits(view.grid(grid))
     rows = torch.nonzero(hits.face >= 0)[:, 0]
     surface = _surface(merged, hits.face[rows], hits.uv[rows], camera)
-    light = _light(scene, view, surface, camera, look)
+    light = _light(scene, view, surface, _dither(rows, view.grid(grid)), camera, look)
     albedo = _albedo(merged, meshes, colours, hits.face[rows], hits.uv[rows])
     tone = torch.where(surface.inner, look.inside, 1.0)[:, None]
     fine = light.new_zeros(len(hits.face), 4)
@@ -155,12 +155,10 @@ def _surface(merged: Merged, face: Tensor, uv: Tensor, camera: Camera) -> _Surfa
     return _Surface(points, smooth * side, flat * side, inner)
 
 
-def _light(scene: RayScene, view: View, surface: _Surface, camera: Camera, look: Look) -> Tensor:
-    """(N,) light that reaches each point: lamp and sky, with what is in the way."""
+def _light(scene: RayScene, view: View, surface: _Surface, turn: Tensor, camera: Camera, look: Look) -> Tensor:
+    """(N,) light that reaches each point: lamp and sky, with what is in the way; turn (N, 2) shifts the ray patterns."""
     up = camera.R.detach().to(surface.points) * surface.points.new_tensor([[1.0], [-1.0], [-1.0]])
     axis = torch.nn.functional.normalize(surface.points.new_tensor(look.lamp), dim=0) @ up  # camera's axes -> world
-    generator = torch.Generator().manual_seed(0)  # one rotation of the ray pattern per point, the same in each picture
-    turn = torch.rand(len(surface.points), 2, generator=generator).to(surface.points)
     origins = view.traced(view.points(surface.points + 2e-3 * surface.flat))
     total = torch.zeros_like(surface.points[:, 0])
     for i in range(look.sky_rays):
@@ -176,6 +174,19 @@ def _light(scene: RayScene, view: View, surface: _Surface, camera: Camera, look:
         lit = ~scene.blocked(origins, view.traced(view.directions(ray)))
         total += look.lamp_light * facing * lit / look.lamp_rays
     return total
+
+
+def _dither(rows: Tensor, grid: Grid) -> Tensor:
+    """(N, 2) shifts in the unit square, evenly spread among neighbours in the fine image, alike in each picture.
+
+    Interleaved gradient noise (Jimenez 2014) at two far places.
+    """
+    (h, w), n = grid.size, grid.n
+    part, pixel = rows // (h * w), rows % (h * w)
+    x = (pixel % w * n + part % n).double()
+    y = (pixel // w * n + part // n).double()
+    noise = [(52.9829189 * ((0.06711056 * (x + s) + 0.00583715 * (y + s)) % 1.0)) % 1.0 for s in (0.0, 47.31)]
+    return torch.stack(noise, 1).float()
 
 
 def _shifted(i: int, n: int, turn: Tensor) -> Tensor:
