@@ -53,19 +53,27 @@ def topology(faces: Tensor) -> Topology:
 
 
 def _build(faces: np.ndarray, device: torch.device) -> Topology:
-    directed = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    forward = directed[:, 0] < directed[:, 1]
-    low, high = directed.min(1), directed.max(1)
-    order = np.argsort(low * (int(faces.max(initial=0)) + 1) + high, kind="stable")
-    low, high, forward, owner = low[order], high[order], forward[order], order // 3
-    first = np.flatnonzero(np.r_[True, (low[1:] != low[:-1]) | (high[1:] != high[:-1])]) if len(low) else order
-    count = np.diff(np.r_[first, len(low)])
-    second = np.where(count > 1, first + 1, first) if len(low) else first
+    vertex_bits, face_bits = (max(int(n).bit_length(), 1) for n in (faces.max(initial=0), len(faces)))
+    if 2 * vertex_bits + face_bits + 1 > 63:
+        raise ValueError(f"render: found a mesh of {len(faces)} faces; wanted at most about a million")
+    corners, rows = faces.T.copy(), np.arange(len(faces))
+    coded = []
+    for one, two in ((0, 1), (1, 2), (2, 0)):  # an edge's use by a face as one number: sorting numbers is quick
+        a, b = corners[one], corners[two]
+        ends = (np.minimum(a, b) << vertex_bits) | np.maximum(a, b)
+        coded.append((((ends << 1) | (a < b)) << face_bits) | rows)
+    uses = np.sort(np.concatenate(coded))
+    ends, forward, owner = uses >> (face_bits + 1), (uses >> face_bits) & 1, uses & ((1 << face_bits) - 1)
+    first = np.flatnonzero(np.diff(ends, prepend=-1))
+    count = np.diff(first, append=len(ends))
+    second = first + (count > 1)
     flipped = (count == 2) & (forward[first] == forward[second])
-    edges, sides = np.stack([low[first], high[first]], 1), np.stack([owner[first], owner[second]], 1)
-    edges_at, sides_at, always, turned = (torch.from_numpy(a).to(device) for a in (edges, sides, count != 2, flipped))
+    ends = ends[first]
+    edges = np.stack([ends >> vertex_bits, ends & ((1 << vertex_bits) - 1)], 1)
+    tensors = (edges, np.stack([owner[first], owner[second]], 1), count != 2, flipped)
     closed = len(faces) > 0 and not bool((count != 2).any() or flipped.any())
-    return Topology(edges_at, sides_at, always, turned, closed)
+    pairs, owners, always, flips = (torch.from_numpy(a).to(device) for a in tensors)
+    return Topology(pairs, owners, always, flips, closed)
 
 
 @dataclass(frozen=True)
