@@ -22,9 +22,9 @@ def read_masks(
     """Garment masks from the user's files, in the order of ``garments``.
 
     Args:
-        paths: with ``labels``: one PNG whose pixel values (palette index or grey level) are labels. Without: one PNG per
-            garment, as ``top=any.png`` or as a file whose name without suffix is the garment's; a pixel is in when its
-            grey value (or its alpha, where the image is transparent somewhere) is above half of the range.
+        paths: with ``labels``: one PNG whose pixel values (palette index or grey level) are labels. Without: one PNG
+            per garment, as ``top=any.png`` or as a file whose name without suffix is the garment's; a pixel is in when
+            its grey value (or its alpha, where the image is transparent somewhere) is above half of the range.
         labels: ``1=top,2=trousers``: which label is which garment; several labels may name one garment.
         garments: the names that are fitted; each needs its mask.
         size: (H, W) of the photo.
@@ -141,7 +141,7 @@ def _checked(masks: dict[str, np.ndarray], garments: Sequence[str]) -> dict[str,
             raise UserError(f"--masks: the mask of {name} has {int(mask.sum())} pixels; wanted at least {MIN_PIXELS}")
         both = int((mask & taken).sum())
         if both > 0.01 * mask.sum():
-            raise UserError(f"--masks: {name} shares {both} pixels with another garment; wanted masks that do not overlap")
+            raise UserError(f"--masks: {name} shares {both} pixels with another garment; wanted no overlap")
         out[name] = torch.from_numpy(mask & ~taken)
         taken |= mask
     return out

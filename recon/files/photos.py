@@ -37,7 +37,7 @@ def read_photo(path: str | Path) -> Tensor:
             image.load()
             pixels = _to_rgb(ImageOps.exif_transpose(image))
     except (UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise UserError(f"{path}: not an image; wanted a photo (JPEG, PNG, WebP, TIFF or BMP)") from error
+        raise UserError(f"{path}: no image that can be read; wanted a JPEG, PNG, WebP, TIFF or BMP photo") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise UserError(f"{path}: damaged or truncated image ({_first_line(error)}); wanted a whole file") from error
     h, w = pixels.shape[:2]

@@ -64,6 +64,11 @@ class Person:
     crop: Crop
     """Where the network looked."""
 
+    @property
+    def size(self) -> float:
+        """Extent of the landmarks [px], the longer side of their box."""
+        return float(np.ptp(self.landmarks[:, :2], axis=0).max())
+
 
 @lru_cache(maxsize=1)
 def _anchors() -> np.ndarray:
@@ -100,7 +105,7 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 
 
 def suppress(boxes: np.ndarray, scores: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted non-maximum suppression (BlazeFace, Bazarevsky et al. 2019, section 4): overlapping answers are averaged.
+    """Weighted non-maximum suppression (Bazarevsky et al. 2019, BlazeFace, section 4): overlapping answers average.
 
     Args: boxes (N, 4) as x0, y0, x1, y1; scores (N,); values (N, D) what to average.
     Returns: averaged values (M, D) and best scores (M,), best first.
@@ -124,7 +129,25 @@ def suppress(boxes: np.ndarray, scores: np.ndarray, values: np.ndarray) -> tuple
 
 
 def detect(rgb: np.ndarray) -> list[Crop]:
-    """All people that the detector sees in rgb (H, W, 3) uint8, as crops for the landmark network, best score first."""
+    """All people that the detector sees in rgb (H, W, 3) uint8, as crops for the landmark network.
+
+    Where it sees nobody in the whole photo it looks again in overlapping tiles of half the size: people less than a
+    fifth of the photo's height are too small for it.
+    """
+    whole = _detect(rgb)
+    if whole:
+        return whole
+    h, w = rgb.shape[:2]
+    side = max(min(h, w, max(h, w) // 2), DETECTOR_SIDE)
+    crops = []
+    for y in sorted({*range(0, max(h - side, 0) + 1, max(side // 2, 1)), max(h - side, 0)}):
+        for x in sorted({*range(0, max(w - side, 0) + 1, max(side // 2, 1)), max(w - side, 0)}):
+            tile = np.ascontiguousarray(rgb[y : y + side, x : x + side])
+            crops += [replace(c, centre=c.centre + [x, y]) for c in _detect(tile)]
+    return crops
+
+
+def _detect(rgb: np.ndarray) -> list[Crop]:
     h, w = rgb.shape[:2]
     scale = max(h, w) / DETECTOR_SIDE
     small = cv2.resize(rgb, (max(1, round(w / scale)), max(1, round(h / scale))), interpolation=cv2.INTER_AREA)
@@ -187,14 +210,24 @@ def _look(rgb: np.ndarray, crop: Crop) -> tuple[Person, Crop]:
 def people(rgb: np.ndarray) -> list[Person]:
     """Everybody in rgb (H, W, 3) uint8, the largest first."""
     found: list[Person] = []
-    for crop in sorted(detect(rgb), key=lambda c: -c.side)[:8]:
-        first, closer = _look(rgb, crop)
-        if first.score < MIN_SCORE:
-            continue
-        second, _ = _look(rgb, closer)
-        best = second if second.score >= MIN_SCORE else first
-        hips = best.landmarks[23:25, :2].mean(0)
-        twice = any(np.linalg.norm(hips - p.landmarks[23:25, :2].mean(0)) < 0.08 * p.crop.side for p in found)
-        if not twice:
-            found.append(replace(best, score=max(first.score, best.score)))
-    return sorted(found, key=lambda p: -p.crop.side)
+    for crop in sorted(detect(rgb), key=lambda c: -c.side)[:12]:
+        person, closer = _look(rgb, crop)
+        for _ in range(2):
+            if person.score < MIN_SCORE:
+                break
+            again, next_crop = _look(rgb, closer)
+            if again.score < MIN_SCORE:
+                break
+            settled = abs(closer.side / person.crop.side - 1) < 0.15
+            person, closer = again, next_crop
+            if settled:
+                break
+        if person.score >= MIN_SCORE and not any(_same(person, other) for other in found):
+            found.append(person)
+    return sorted(found, key=lambda p: -p.size)
+
+
+def _same(a: Person, b: Person) -> bool:
+    hips = a.landmarks[23:25, :2].mean(0) - b.landmarks[23:25, :2].mean(0)
+    nose = a.landmarks[0, :2] - b.landmarks[0, :2]
+    return bool(max(np.linalg.norm(hips), np.linalg.norm(nose)) < 0.15 * max(a.size, b.size))

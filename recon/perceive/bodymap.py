@@ -25,7 +25,7 @@ class BodyMap:
     arm: np.ndarray
     """(h, w) place along the nearest arm: 0 shoulder, 1 elbow, 2 wrist, more on the hand."""
     arm_axis: np.ndarray
-    """(h, w) distance to the nearest arm's axis in its radii, below 1 on a bare arm, also where it is before the trunk."""
+    """(h, w) distance to the nearest arm's axis in its radii, below 1 on a bare arm, before the trunk, too."""
     leg: np.ndarray
     """(h, w) place along the nearest leg: 0 hip, 1 knee, 2 ankle, more on the foot."""
     hand: np.ndarray
@@ -73,7 +73,7 @@ def _polygon(shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
 
 
 def _limb(grid: np.ndarray, joints: list[np.ndarray], radii: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to a limb of two bones in its radii, and the place along it (0, 1 and 2 at the joints; beyond goes on)."""
+    """Distance to a limb of two bones in its radii, and the place along it (0, 1, 2 at the joints; goes on beyond)."""
     (d0, t0), (d1, t1) = _segment(grid, joints[0], joints[1]), _segment(grid, joints[1], joints[2])
     upper = d0 / radii[0] <= d1 / radii[1]
     place = np.where(upper, np.clip(t0, None, 1), 1 + np.clip(t1, 0, None))
@@ -117,6 +117,7 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
     legs = {k: _limb(grid, [p[a], p[b], p[c]], (0.24 * width, 0.18 * width)) for k, (a, b, c, _) in LEGS.items()}
     hand = np.minimum(*(_hand(grid, p, c, tip, width) for _, _, c, tip in ARMS.values()))
     foot = np.minimum(*(_foot(grid, p, c, sole, width) for _, _, c, sole in LEGS.values()))
+
     def pick(limbs: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         (d0, t0), (d1, t1) = limbs.values()
         return np.where(d0 <= d1, t0, t1)
@@ -142,10 +143,27 @@ def body_map(shape: tuple[int, int], p: np.ndarray) -> BodyMap:
         d, t = _segment(grid, p[a], p[b])
         thighs |= (d < 0.13 * width) & (t > 0.15) & (t < 0.7)
     return BodyMap(
-        part=part, up=up, across=across, arm=pick(arms), arm_axis=np.minimum(*(d for d, _ in arms.values())), leg=pick(legs), hand=hand, foot=foot, head=head,
+        part=part,
+        up=up,
+        across=across,
+        arm=pick(arms),
+        arm_axis=np.minimum(*(d for d, _ in arms.values())),
+        leg=pick(legs),
+        hand=hand,
+        foot=foot,
+        head=head,
         neck=np.linalg.norm(grid - p[11:13].mean(0) - 0.12 * unit * axis, axis=-1) / width,
-        beside=beside, gap=np.min(np.stack(near, -1), -1), behind=bool(p[11, 0] < p[12, 0]), chin=chin, unit=unit, width=width, face=_polygon(shape, face_points), cheeks=_cheeks(shape, p), core=core, thighs=thighs,
-    )  # fmt: skip
+        beside=beside,
+        gap=np.min(np.stack(near, -1), -1),
+        behind=bool(p[11, 0] < p[12, 0]),
+        chin=chin,
+        unit=unit,
+        width=width,
+        face=_polygon(shape, face_points),
+        cheeks=_cheeks(shape, p),
+        core=core,
+        thighs=thighs,
+    )
 
 
 def _cheeks(shape: tuple[int, int], p: np.ndarray) -> np.ndarray:

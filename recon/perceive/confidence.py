@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from recon.perceive.bodymap import BodyMap
 from recon.perceive.parse import Parsed
 from recon.perceive.zones import JACKET, LAYERS, LOWER, TOP
 
@@ -19,7 +18,9 @@ def pose_confidence(landmarks: np.ndarray) -> float:
 
 
 def garment_confidence(layer: int, parsed: Parsed, person: np.ndarray, landmarks: np.ndarray) -> float:
-    """Confidence in [0, 1]: (share of the mask's border against other layers that colours alone confirm) x (visibility).
+    """Confidence in [0, 1]: how much of the mask's border colours alone confirm, times visibility.
+
+    Borders against other layers count; those against the background are the person mask's business.
 
     A border is confirmed at a pixel near it when the pixel's colour likes its own layer better than the neighbour's; of
     two layers of one colour half of the pixels do so by chance, which counts as nothing.

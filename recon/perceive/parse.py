@@ -1,10 +1,10 @@
 """The pose-seeded split of a person into the garments that the user names, without a parsing network.
 
 Each layer (jacket, top or dress, lower garment, skin, hair, shoes) has a colour mixture learned from this photo alone,
-at seeds that the pose gives, and a place: sleeves, hems and waist as one-dimensional splits (``zones``), skin only where
-skin can be (head, beyond sleeves and hems, a bared waist). Colour and place make one energy a pixel; mean-field steps
-with an edge-aware filter as the message smooth it (Kraehenbuehl and Koltun 2011, with He's guided filter in place of the
-bilateral one); the mixtures are then learned again from what was found.
+at seeds that the pose gives, and a place: sleeves, hems and waist as one-dimensional splits (``zones``), skin only
+where skin can be (head, beyond sleeves and hems, a bared waist). Colour and place make one energy a pixel; mean-field
+steps with an edge-aware filter as the message smooth it (Kraehenbuehl and Koltun 2011, with He's guided filter in place
+of the bilateral one); the mixtures are then learned again from what was found.
 """
 
 from __future__ import annotations
@@ -18,7 +18,20 @@ import numpy as np
 from recon.perceive.bodymap import ARM_L, ARM_R, HEAD, LEG_L, LEG_R, TORSO, BodyMap
 from recon.perceive.colours import FLOOR, SHADED, SPREAD, fit_mixture, lab
 from recon.perceive.segment import guided
-from recon.perceive.zones import BACKGROUND, HAIR, JACKET, LAYERS, LOWER, SHOE, SKIN, TOP, ZONES, Zone, limb_ends, waist_split
+from recon.perceive.zones import (
+    BACKGROUND,
+    HAIR,
+    JACKET,
+    LAYERS,
+    LOWER,
+    SHOE,
+    SKIN,
+    TOP,
+    ZONES,
+    Zone,
+    limb_ends,
+    waist_split,
+)
 
 MESSAGE = 4.0
 """Weight of the neighbours' opinion against a pixel's own log-likelihoods."""
@@ -206,7 +219,11 @@ def find_ends(colour: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Out
         if JACKET in outfit.zones:
             side = middle & (np.abs(body.across) > 0.6)
             ends.jacket, _, evidence["jacket"] = waist_split(
-                body.up[side], colour[..., JACKET][side], cloth[side], skin[side] * 0 + FLOOR, outfit.zones[JACKET].waist
+                body.up[side],
+                colour[..., JACKET][side],
+                cloth[side],
+                np.full(int(side.sum()), FLOOR),
+                outfit.zones[JACKET].waist,
             )
     ends.evidence = evidence
     return ends

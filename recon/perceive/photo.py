@@ -19,6 +19,8 @@ from recon.perceive.segment import Window, person_mask, window_around
 from recon.perceive.zones import HAIR, JACKET, LOWER, SHOE, SKIN, TOP, ZONES
 from recon.types import Photo, UserError
 
+MAX_SIDE = 2048
+"""Larger photos are shrunk to this for perception [px]; masks and landmarks come back in the photo's own pixels."""
 LAYER_NAMES = {JACKET: "jacket", TOP: "top or dress", LOWER: "lower garment"}
 CUT_PARTS = {
     "feet": (29, 30, 31, 32), "legs": (25, 26, 27, 28), "hands": (15, 16), "head": (0, 2, 5), "hips": (23, 24),
@@ -42,6 +44,9 @@ def perceive(
     """
     names = ordered(garments)
     image = np.ascontiguousarray(rgb.cpu().numpy())
+    shrink = min(1.0, MAX_SIDE / max(image.shape[:2]))
+    if shrink < 1:
+        image = cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     found, notes = choose(blazepose.people(image), person)
     notes += cut_off(found.landmarks, image.shape[:2])
     window = window_around(found.mask, found.landmarks)
@@ -55,13 +60,15 @@ def perceive(
     for layer, name in outfit.names.items():
         sure = garment_confidence(layer, parsed, soft > 0.5, found.landmarks)
         confidence[name] = 1.0 if masks and name in masks else sure
-    seen = with_masks(seen, masks or {})
+    size = (int(rgb.shape[0]), int(rgb.shape[1]))
+    seen = with_masks(enlarged(seen, size), masks or {})
+    scale = np.array([size[1] / image.shape[1], size[0] / image.shape[0], 1.0])
     return Photo(
         rgb=rgb,
         person=torch.from_numpy(seen.person),
         garments={name: torch.from_numpy(seen.layers[name]) for name in names},
         ignore=torch.from_numpy(seen.ignore),
-        landmarks=torch.from_numpy(found.landmarks).float(),
+        landmarks=torch.from_numpy(found.landmarks * scale).float(),
         landmarks_world=torch.from_numpy(found.world).float(),
         confidence=confidence,
         notes=tuple(notes + doubts(seen, confidence)),
@@ -135,6 +142,17 @@ def assemble(
     return Seen(whole(person), {n: whole(labels == layer) for layer, n in outfit.names.items()}, whole(ignore))
 
 
+def enlarged(seen: Seen, size: tuple[int, int]) -> Seen:
+    """The masks at ``size`` (H, W)."""
+    if seen.person.shape == size:
+        return seen
+
+    def grow(mask: np.ndarray) -> np.ndarray:
+        return cv2.resize(mask.astype(np.float32), size[::-1], interpolation=cv2.INTER_LINEAR)
+
+    return Seen(grow(seen.person), {n: grow(m) > 0.5 for n, m in seen.layers.items()}, grow(seen.ignore) > 0.5)
+
+
 def before_garments(body: BodyMap) -> np.ndarray:
     """(h, w) bool: where skin may hide a garment: hands, and bare arms before the trunk or the legs."""
     arm = (body.part == ARM_L) | (body.part == ARM_R)
@@ -158,5 +176,6 @@ def doubts(seen: Seen, confidence: dict[str, float]) -> list[str]:
         if mask.sum() < 0.003 * (seen.person > 0.5).sum():
             notes.append(f"{name}: hardly any of it found; give its mask with --masks")
         elif confidence[name] < 0.45:
-            notes.append(f"{name}: its mask is uncertain (confidence {confidence[name]:.2f}); check the overlay or give --masks")
+            sure = f"confidence {confidence[name]:.2f}"
+            notes.append(f"{name}: its mask is uncertain ({sure}); check the overlay or give --masks")
     return notes

@@ -58,7 +58,8 @@ def guided(guide: np.ndarray, values: np.ndarray, radius: int, eps: float) -> np
     """Guided filter of (h, w) or (h, w, C) float values under a colour guide (h, w, 3) uint8."""
     engine = cv2.ximgproc.createGuidedFilter(guide.astype(np.float32) / 255, radius, eps)
     layers = values[..., None] if values.ndim == 2 else values
-    out = np.stack([engine.filter(np.ascontiguousarray(layers[..., k], np.float32)) for k in range(layers.shape[-1])], -1)
+    planes = [np.ascontiguousarray(layers[..., k], np.float32) for k in range(layers.shape[-1])]
+    out = np.stack([engine.filter(plane) for plane in planes], -1)
     return out[..., 0] if values.ndim == 2 else out
 
 

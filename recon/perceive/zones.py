@@ -1,7 +1,7 @@
 """Where garments may be worn, by the name that the user gave, and where they end on this photo.
 
-Sleeves, hems and waists cut a limb once: cloth before, something else after. So they are found as one-dimensional splits
-of a colour score along the limb, which needs far less colour evidence than deciding pixel by pixel.
+Sleeves, hems and waists cut a limb once: cloth before, something else after. So they are found as one-dimensional
+splits of a colour score along the limb, which needs far less colour evidence than deciding pixel by pixel.
 """
 
 from __future__ import annotations
