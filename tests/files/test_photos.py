@@ -41,7 +41,9 @@ def test_formats(tmp_path: Path, picture: np.ndarray, suffix: str, tolerance: in
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_exif_orientation(tmp_path: Path, picture: np.ndarray, orientation: int) -> None:
-    undo = {1: None, 2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}[orientation]  # Pillow's transpositions, inverse of EXIF's
+    undo = {1: None, 2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}[
+        orientation
+    ]  # Pillow's transpositions, inverse of EXIF's
     stored = Image.fromarray(picture)
     stored = stored if undo is None else stored.transpose(Image.Transpose(undo))
     exif = Image.Exif()
