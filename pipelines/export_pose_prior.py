@@ -3,7 +3,7 @@
 Clips are npz files at 30 frames a second: ``names`` (J), ``parents`` (J), ``offsets`` (J, 3) [m], ``rotvec`` (F, J, 3)
 local axis-angle [rad], y up, left = +x. A clip's world rotations go over to the 24-joint rig limb by limb: the rig's
 limb points along its own rest direction, so ``W_rig = W_clip C`` where C is the smallest rotation that takes the rig's
-rest direction to the clip's. Root turning about the vertical is removed; every pose is also used mirrored.
+rest direction to the clip's. The pelvis turns freely and is no part of the prior; every pose is also used mirrored.
 
 The result is a Gaussian over the 69 local axis-angle numbers of joints 1..23: mean and Cholesky factor of the shrunk
 covariance (correlations are pulled towards 0, standard deviations have a floor; hands, toes and collars by hand, clips
@@ -115,7 +115,7 @@ def hinge_forward(world: np.ndarray, side: str) -> None:
         return
     angle = np.arctan(z / y)  # the nearer way round: an elbow that overstretches a little keeps doing so
     turn = Rotation.from_rotvec([angle, 0, 0]).as_matrix()
-    for j in (arm, elbow, wrist):
+    for j in (arm, elbow, wrist, JOINT_NAMES.index(side + "hand")):
         world[:, j] = world[:, j] @ turn
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from recon.types import BodyPose, Mesh, PosedBody, UserError
 
 
+@runtime_checkable
 class Body(Protocol):
     """What every body answers to: batched, differentiable in shape, pose and translation."""
 

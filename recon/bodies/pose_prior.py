@@ -1,7 +1,7 @@
 """How likely a pose is: anatomical limits, and a Gaussian learned from people who stand and move.
 
-The Gaussian comes from ``pipelines/export_pose_prior.py``. Energies are in units of one ordinary pose: about 1 for a pose
-as the clips have them, and limits add ``(excess / LIMIT_SOFTNESS)²`` for each number that leaves its box.
+The Gaussian comes from ``pipelines/export_pose_prior.py``. Energies are in units of one ordinary pose: about 1 for a
+pose as the clips have them; limits add ``(excess / LIMIT_SOFTNESS)²`` for each number that leaves its box.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ DEGREES = {
     "head": ((-45, 55), (-50, 50), (-35, 35)),
     "l_hip": ((-130, 40), (-50, 60), (-45, 75)),
     "l_knee": ((-10, 150), (-15, 15), (-10, 10)),
-    "l_ankle": ((-50, 50), (-35, 35), (-35, 35)),
+    "l_ankle": ((-50, 50), (-42, 40), (-35, 35)),
     "l_foot": ((-45, 25), (-10, 10), (-10, 10)),
     "l_collar": ((-25, 25), (-30, 30), (-30, 40)),
     "l_shoulder": ((-90, 90), (-135, 75), (-110, 95)),
