@@ -8,18 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.fit_result import FitResult
 from recon.files.atomic import write_whole
 from recon.files.patterns import pattern_svg
-
-if TYPE_CHECKING:
-    from pipelines.results import FitResult
 
 LONGEST = 1000
 """Longer side of photos in the report [px]."""

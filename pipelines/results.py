@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -15,33 +15,17 @@ from torch import Tensor
 from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size
+from pipelines.fit_result import FitResult
 from pipelines.measure import body_overlap, geometry, overlaps
 from pipelines.report import colour_of, write_pictures, write_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
 from recon.files.meshes import write_glb, write_obj
 from recon.files.patterns import write_svg
-from recon.types import BodyPose, Camera, Mesh, Photo
+from recon.types import Camera, Mesh, Photo
 
 SCHEMA = 1
 
-
-@dataclass(frozen=True)
-class FitResult:
-    """What ``fit_photo`` found; the same as the files in ``folder``, as tensors. World: feet at y = 0."""
-
-    folder: Path
-    figures: dict
-    """The content of ``result.json``."""
-    photo: Photo
-    camera: Camera
-    body_pose: BodyPose
-    body: Mesh
-    """(V, 3) posed body."""
-    layers: tuple[Layer, ...]
-    """Rest-pose garments with their panels, outermost first."""
-    garments: dict[str, Mesh]
-    """Name -> refined mesh (V, 3), welded and open, in the pose of the photo."""
 
 
 def grounded(body: Mesh, meshes: dict[str, Mesh], camera: Camera) -> tuple[Mesh, dict[str, Mesh], Camera, Tensor]:

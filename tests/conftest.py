@@ -1,4 +1,4 @@
-"""What every test shares: a run in which no test passed counts as failed."""
+"""What every test shares: annotations are checked at run time, and a run in which no test passed counts as failed."""
 
 from __future__ import annotations
 
@@ -6,8 +6,16 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from beartype import BeartypeConf
+from beartype.claw import beartype_packages
 
-from recon.types import Garment, Mesh
+# Before anything of the project is imported: from here on every call and return is held against its annotations.
+# Modules with warp kernels are left out: a kernel's annotations are types of warp's language, not Python's.
+KERNELS = ("recon.cloth.contact", "recon.cloth.xpbd", "recon.render.raster")
+CHECKED = BeartypeConf(is_pep484_tower=True, claw_is_pep526=False, claw_skip_package_names=KERNELS)
+beartype_packages(("recon", "pipelines"), conf=CHECKED)
+
+from recon.types import Garment, Mesh  # noqa: E402
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:

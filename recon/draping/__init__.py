@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from recon.types import Garment, Mesh, PosedBody
 
 
+@runtime_checkable
 class Draper(Protocol):
     """What every draper answers to."""
 

@@ -143,7 +143,7 @@ def _components(faces: NDArray[np.int64], n: int) -> NDArray[np.int64]:
 
     rows, columns = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
     graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(n, n))
-    return connected_components(graph, directed=False)[1]
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def _loops(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -36,6 +36,7 @@ DECODERS: dict[str, str] = {"isp": "recon.garments.isp:load_isp"}
 """Decoder name -> ``module:function`` of (kind, folder, device)."""
 
 
+@runtime_checkable
 class GarmentDecoder(Protocol):
     """What every decoder answers to."""
 

@@ -6,16 +6,17 @@ import re
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
+from pipelines.fit_garment import Layer
+from pipelines.fit_result import FitResult
 from pipelines.report import Pictures, draw_overlay, write_pictures, write_report
 from recon.render.shade import orbit_camera
-from recon.types import Photo
+from recon.types import BodyPose, Photo
 
 VOID = {"meta", "img", "br", "link", "path", "rect"}
 
@@ -77,16 +78,9 @@ def result(tmp_path, flat_shirt):
     mask = torch.zeros(96, 64, dtype=torch.bool)
     mask[20:60, 10:50] = True
     photo = Photo(rgb, mask.float(), {"top": mask}, ~mask, torch.zeros(33, 3), torch.zeros(33, 3))
-    layers = (SimpleNamespace(name="top", garment=shirt),)
-    return SimpleNamespace(
-        folder=tmp_path,
-        figures=FIGURES,
-        photo=photo,
-        camera=camera,
-        body=inner,
-        layers=layers,
-        garments={"top": shirt.mesh},
-    )
+    pose = BodyPose(torch.zeros(1, 2), torch.zeros(1, 24, 3), torch.zeros(1, 3))
+    garments = {"top": shirt.mesh}
+    return FitResult(tmp_path, FIGURES, photo, camera, pose, inner, (Layer("top", shirt),), garments)
 
 
 def test_one_file_that_loads_nothing(result):
