@@ -196,3 +196,8 @@ def test_person_masks_against_given_ones(shared_photos, name: str, garments: tup
     truth = cv2.imread(str(path.with_name(path.stem + "_mask.png")), cv2.IMREAD_GRAYSCALE) > 127
     photo = perceive(read_photo(path), garments)
     assert iou(photo.person.numpy() > 0.5, truth) > least
+
+
+def test_unknown_source() -> None:
+    with pytest.raises(UserError, match="wanted one of photo"):
+        perceive(torch.zeros((200, 200, 3), dtype=torch.uint8), ["top"], source="crystal ball")
