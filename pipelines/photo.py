@@ -94,7 +94,8 @@ def fit_photo(config: PhotoFit, say: Say | None = None, tick=None) -> FitResult:
 
     torch.manual_seed(config.seed)
     rgb = read_photo(config.photo)
-    masks = read_masks(config.masks, config.labels, config.garments, tuple(rgb.shape[:2])) if config.masks else None
+    size = rgb.shape[0], rgb.shape[1]
+    masks = read_masks(config.masks, config.labels, config.garments, size) if config.masks else None
     models = load_models(config.garments, config)
     run = open_run(config, masks, say)
     photo = run.stage("perceive", perceive, rgb, config.garments, config.person, masks)

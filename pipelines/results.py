@@ -20,12 +20,11 @@ from pipelines.measure import body_overlap, geometry, overlaps
 from pipelines.report import colour_of, write_pictures, write_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
-from recon.files.meshes import write_glb, write_obj
+from recon.files.meshes import Colour, write_glb, write_obj
 from recon.files.patterns import write_svg
-from recon.types import Camera, Mesh, Photo
+from recon.types import Camera, Garment, Mesh, Photo
 
 SCHEMA = 1
-
 
 
 def grounded(body: Mesh, meshes: dict[str, Mesh], camera: Camera) -> tuple[Mesh, dict[str, Mesh], Camera, Tensor]:
@@ -107,7 +106,7 @@ def write_results(
         "notes": list(photo.notes),
     }
     write_obj(body, out / "body.obj", "body")
-    parts = {"body": (body, colour_of("body"))}
+    parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, colour_of("body"))}
     for layer in layers:
         garment = replace(layer.garment, mesh=moved[layer.name])
         write_obj(garment, out / f"{layer.name}.obj", layer.name)
