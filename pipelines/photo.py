@@ -1,4 +1,4 @@
-"""From one photo to simulation-ready garments: perceive, fit the body, fit each garment outer to inner, refine, write."""
+"""From one photo to simulation-ready garments: perceive, fit the body, fit garments outer to inner, refine, write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The results of a fit: figures, meshes, patterns, pictures, ``result.json`` and the report, written to the run's folder."""
+"""The results of a fit: figures, meshes, patterns, pictures, ``result.json`` and the report, in the run's folder."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def measure_all(
 def write_results(
     config, photo: Photo, models: Models, fitted: tuple[dict[str, Tensor], list[Layer], dict[str, Mesh]], seconds: dict
 ) -> FitResult:
-    """Measure, write everything but ``result.json``, then ``result.json`` last (its presence says that all is there)."""
+    """Measure, write all files, and last ``result.json``: its presence says that the others are there."""
     begin = time.perf_counter()
     values, layers, meshes = fitted
     out = Path(config.out)
