@@ -10,7 +10,7 @@ from torch import Tensor
 from recon.types import Photo, UserError
 
 SOURCES: dict[str, str] = {"photo": "recon.perceive.photo:perceive"}
-"""Source of the evidence -> ``module:function`` of (rgb, garments, person, masks): another estimator is one line here."""
+"""Source of the evidence -> ``module:function`` of (rgb, garments, person, masks); a new one is a line here."""
 
 
 def perceive(

@@ -9,14 +9,14 @@ of the bilateral one); the mixtures are then learned again from what was found.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from recon.perceive.bodymap import ARM_L, ARM_R, HEAD, LEG_L, LEG_R, TORSO, BodyMap
 from recon.perceive.colours import FLOOR, SHADED, SPREAD, fit_mixture, lab
+from recon.perceive.place import NEVER, past, place
 from recon.perceive.segment import guided
 from recon.perceive.zones import (
     BACKGROUND,
@@ -27,8 +27,8 @@ from recon.perceive.zones import (
     SHOE,
     SKIN,
     TOP,
-    ZONES,
-    Zone,
+    Ends,
+    Outfit,
     limb_ends,
     waist_split,
 )
@@ -36,56 +36,10 @@ from recon.perceive.zones import (
 MESSAGE = 4.0
 """Weight of the neighbours' opinion against a pixel's own log-likelihoods."""
 ROUNDS, STEPS = 2, 4
-NEVER = -60.0
-"""Energy of a layer that cannot be here."""
 COMPONENTS = {HAIR: 2, BACKGROUND: 6}
 """Components of a layer's colour mixture, where not 4."""
 MIN_SEED = 40
 """Fewer pixels teach no colour."""
-
-
-@dataclass(frozen=True)
-class Outfit:
-    """What is worn, by layer; unnamed layers are there all the same, so that they are not taken for a named one."""
-
-    zones: dict[int, Zone]
-    """Layer -> zone; a dress has no LOWER."""
-    names: dict[int, str]
-    """Layer -> the user's name, for the named ones."""
-
-    @staticmethod
-    def of(garments: Sequence[str]) -> Outfit:
-        """The outfit of the user's garment names (keys of ``ZONES``, at most one a layer)."""
-        names = {ZONES[name].layer: name for name in garments}
-        zones = {layer: ZONES[name] for layer, name in names.items()}
-        if TOP not in zones:
-            zones[TOP] = ZONES["top"]
-        if LOWER not in zones and names.get(TOP) != "dress":
-            zones[LOWER] = ZONES["trousers"]
-        return Outfit(zones, names)
-
-    @property
-    def dress(self) -> bool:
-        """Whether one piece covers trunk and legs."""
-        return LOWER not in self.zones
-
-
-@dataclass
-class Ends:
-    """Where the garments end on this photo."""
-
-    sleeve: dict[int, float] = field(default_factory=dict)
-    """Arm part -> end of the outer sleeve along the arm."""
-    hem: dict[int, float] = field(default_factory=dict)
-    """Leg part -> end of the lower garment (or dress) along the leg."""
-    upper: float = 0.0
-    """Height where the upper garment ends, on the trunk."""
-    lower: float = 0.0
-    """Height where the lower garment begins."""
-    jacket: float = 0.0
-    """Height where the jacket ends."""
-    evidence: dict[str, float] = field(default_factory=dict)
-    """'waist', 'jacket', 'sleeve', 'hem' -> how far colours support the end, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +71,7 @@ def split(rgb: np.ndarray, person: np.ndarray, body: BodyMap, outfit: Outfit) ->
         colour = _colour(colours, person, samples, first=k == 0)
         ends = find_ends(colour, inner, body, outfit)
         energy = colour + place(body, outfit, ends)
-        energy[..., HAIR] -= np.where(long_hair(colour, inner, body), 0, _past(body.chin + 0.05 - body.up, 60, 12))
+        energy[..., HAIR] -= np.where(long_hair(colour, inner, body), 0, past(body.chin + 0.05 - body.up, 60, 12))
         belief = smooth(rgb, energy, person)
         best, sure = belief.argmax(-1), (belief.max(-1) > 0.85) & inner
         samples = {n: np.vstack([x, *[colours[sure & (best == n)]] * 2]) for n, x in seeds.items() if n != BACKGROUND}
@@ -234,78 +188,6 @@ def long_hair(colour: np.ndarray, person: np.ndarray, body: BodyMap) -> bool:
     beside = body.beside & person & (body.part != TORSO)
     hair = colour[..., HAIR] > colour[..., [JACKET, TOP, SKIN]].max(-1)
     return bool((hair & beside).sum() > max(0.4 * beside.sum(), 0.0008 * person.sum()))
-
-
-def _past(z: np.ndarray, slope: float, most: float) -> np.ndarray:
-    """Cost that grows with the way ``z`` past an end, at most ``most``."""
-    return np.clip(slope * np.clip(z, -1e3, 1e3), 0, most)
-
-
-def place(body: BodyMap, outfit: Outfit, ends: Ends) -> np.ndarray:
-    """(h, w, LAYERS) log-priors of place."""
-    out = np.zeros((*body.part.shape, LAYERS), np.float32)
-    arm = (body.part == ARM_L) | (body.part == ARM_R)
-    leg = (body.part == LEG_L) | (body.part == LEG_R)
-    sleeve = np.where(body.part == ARM_L, ends.sleeve[ARM_L], ends.sleeve[ARM_R])
-    hem = np.where(body.part == LEG_L, ends.hem[LEG_L], ends.hem[LEG_R])
-    past_sleeve, past_hem = np.where(arm, body.arm - sleeve, 0), np.where(leg, body.leg - hem, 0)
-    head = np.where(body.part == HEAD, _past(1.15 - body.head, 30, 12), 0)
-    head = head + _past(body.up - body.chin, 25, 10)
-
-    for layer in (JACKET, TOP):
-        if layer in outfit.zones:
-            out[..., layer] -= _past(past_sleeve, 25, 12) + head
-            end = ends.jacket if layer == JACKET else ends.upper
-            below = _past(end - body.up, 20, 12) if not outfit.dress else _past(past_hem, 25, 12)
-            out[..., layer] -= np.where(arm, np.minimum(below, 2), below)
-            out[..., layer] -= _past(0.9 - body.foot, 20, 6)
-        else:
-            out[..., layer] = NEVER
-    if JACKET in outfit.zones:
-        out[..., TOP] -= np.where(arm, 8, 0) + _past(np.abs(body.across) - 0.45, 14, 8)
-        out[..., JACKET] -= _past(0.35 - np.abs(body.across), 4, 1) + _past(0.16 - body.neck, 30, 6)
-    if outfit.dress:
-        out[..., LOWER] = NEVER
-    else:
-        out[..., LOWER] -= _past(body.up - ends.lower, 20, 12) + _past(past_hem, 25, 12) + head
-        out[..., LOWER] -= np.where(arm & (body.up > -0.3), 3, 0)
-        out[..., LOWER] -= _past(0.7 - body.foot, 20, 4)
-    out[..., SKIN] -= _skin_cost(body, arm, leg, past_sleeve, past_hem, ends, outfit)
-    out[..., HAIR] -= _past(body.head - 1.2, 5, 14) + np.where(arm | leg, 4, 0) + np.where(body.face, 3, 0)
-    out[..., SHOE] -= np.where(leg, _past(1.9 - body.leg, 25, 20), np.float32(20))
-    out[..., SHOE] -= np.minimum(_past(body.foot - 1.0, 4, 8), np.where(past_hem > 0, 2, 8))
-    # The person's mask closes narrow gaps: between the legs, between arm and trunk.
-    out[..., BACKGROUND] -= 1.5 + _past(0.7 - body.gap, 12, 12) + _past(0.8 - body.neck, 20, 12)
-    return out
-
-
-def _skin_cost(
-    body: BodyMap,
-    arm: np.ndarray,
-    leg: np.ndarray,
-    past_sleeve: np.ndarray,
-    past_hem: np.ndarray,
-    ends: Ends,
-    outfit: Outfit,
-) -> np.ndarray:
-    """(h, w) cost of skin: it needs a place as well as a colour."""
-    cost = np.full(body.part.shape, 12.0, np.float32)
-    cost = np.where(arm, _past(-past_sleeve, 25, 12), cost)
-    cost = np.where(leg, _past(-past_hem, 25, 12), cost)
-    cost = np.minimum(cost, _past(body.hand - 0.9, 8, 12))
-    cost = np.minimum(cost, _past(body.head - 1.0, 8, 12))
-    neckline = 0.2 if JACKET in outfit.zones else 0.5 if outfit.zones[TOP].sleeve.low < 0 else 0.32
-    cost = np.minimum(cost, np.minimum(_past(body.neck - 0.1, 5, 12) + _past(body.neck - neckline, 25, 12), 12))
-    # A bare arm may be in front of the trunk; there the colour decides.
-    arm_end = np.where(body.across > 0, ends.sleeve[ARM_L], ends.sleeve[ARM_R])
-    in_front = 1.5 + _past(body.arm_axis - 1.0, 16, 12) + _past(arm_end + 0.15 - body.arm, 25, 12)
-    cost = np.minimum(cost, np.where(body.part == TORSO, in_front, 12))
-    if outfit.zones[TOP].sleeve.high < 0.5:  # straps leave shoulders and shoulder blades bare
-        cost = np.minimum(cost, 2.5 + _past(0.45 - body.up, 25, 12))
-    if ends.upper > ends.lower:
-        bared = np.maximum(body.up - ends.upper, ends.lower - body.up)
-        cost = np.minimum(cost, np.where(arm, cost, _past(bared, 25, 12)))
-    return cost
 
 
 def smooth(rgb: np.ndarray, energy: np.ndarray, person: np.ndarray) -> np.ndarray:

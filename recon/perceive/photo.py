@@ -14,9 +14,9 @@ from recon.perceive import blazepose
 from recon.perceive.bodymap import ARM_L, ARM_R, BodyMap, body_map
 from recon.perceive.cleanup import sharpen, tidy
 from recon.perceive.confidence import garment_confidence, pose_confidence
-from recon.perceive.parse import Outfit, Parsed, split
+from recon.perceive.parse import Parsed, split
 from recon.perceive.segment import Window, person_mask, window_around
-from recon.perceive.zones import HAIR, JACKET, LOWER, SHOE, SKIN, TOP, ZONES
+from recon.perceive.zones import HAIR, JACKET, LOWER, SHOE, SKIN, TOP, ZONES, Outfit
 from recon.types import Photo, UserError
 
 MAX_SIDE = 2048

@@ -6,7 +6,8 @@ splits of a colour score along the limb, which needs far less colour evidence th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -60,6 +61,50 @@ ZONES = {
     "dress": Zone(TOP, sleeve=Range(-0.3, 0.3, 2.2), hem=Range(0.2, 0.9, 2.1), between=True),
 }
 """Garment name -> where it may be worn: a new name is a line here."""
+
+
+@dataclass(frozen=True)
+class Outfit:
+    """What is worn, by layer; unnamed layers are there all the same, so that they are not taken for a named one."""
+
+    zones: dict[int, Zone]
+    """Layer -> zone; a dress has no LOWER."""
+    names: dict[int, str]
+    """Layer -> the user's name, for the named ones."""
+
+    @staticmethod
+    def of(garments: Sequence[str]) -> Outfit:
+        """The outfit of the user's garment names (keys of ``ZONES``, at most one a layer)."""
+        names = {ZONES[name].layer: name for name in garments}
+        zones = {layer: ZONES[name] for layer, name in names.items()}
+        if TOP not in zones:
+            zones[TOP] = ZONES["top"]
+        if LOWER not in zones and names.get(TOP) != "dress":
+            zones[LOWER] = ZONES["trousers"]
+        return Outfit(zones, names)
+
+    @property
+    def dress(self) -> bool:
+        """Whether one piece covers trunk and legs."""
+        return LOWER not in self.zones
+
+
+@dataclass
+class Ends:
+    """Where the garments end on this photo."""
+
+    sleeve: dict[int, float] = field(default_factory=dict)
+    """Arm part -> end of the outer sleeve along the arm."""
+    hem: dict[int, float] = field(default_factory=dict)
+    """Leg part -> end of the lower garment (or dress) along the leg."""
+    upper: float = 0.0
+    """Height where the upper garment ends, on the trunk."""
+    lower: float = 0.0
+    """Height where the lower garment begins."""
+    jacket: float = 0.0
+    """Height where the jacket ends."""
+    evidence: dict[str, float] = field(default_factory=dict)
+    """'waist', 'jacket', 'sleeve', 'hem' -> how far colours support the end, in [0, 1]."""
 
 
 def profile(place: np.ndarray, score: np.ndarray, low: float, high: float, least: int) -> tuple[np.ndarray, np.ndarray]:
