@@ -1,4 +1,4 @@
-"""Edges at which an image can jump, and points on them: the geometry of edge-sampled gradients.
+"""Edges at which an image can jump, and their lines in the image: the geometry of edge-sampled gradients.
 
 The image of opaque triangles is discontinuous only where the projection of an open border lies, or of a fold: an edge
 with both of its faces on one side of it. Which of these are seen, and what is seen on their two sides, rays decide.
@@ -16,9 +16,6 @@ import torch
 from torch import Tensor
 
 from recon.render.view import NEAR
-
-LONGEST = 4096
-"""Most points on one edge."""
 
 
 @dataclass(frozen=True)
@@ -77,26 +74,56 @@ def _build(faces: np.ndarray, device: torch.device) -> Topology:
 
 
 @dataclass(frozen=True)
-class EdgePoints:
-    """Points on the candidate edges, and what moves them."""
+class Lines:
+    """Edges as straight lines in the image, from 0 at their first end to 1 at their last."""
 
-    position: Tensor
-    """(N, 2) output pixels from the image's centre."""
-    normal: Tensor
-    """(N, 2) unit normals of their edges in the image."""
-    weight: Tensor
-    """(N,) length of edge that each stands for [px]."""
+    ends: Tensor
+    """(E, 2, 2) output pixels from the image's centre; an edge that crosses the near plane is cut there."""
+    depths: Tensor
+    """(E, 2) of these ends [m]."""
+    cut: Tensor
+    """(E, 2) where on the edge itself these ends lie, 0 = its first vertex, 1 = its second."""
     vertices: Tensor
-    """(N, 2) long: the edge's end vertices."""
-    share: Tensor
-    """(N, 2) how far the normal motion of each end vertex's projection moves the point, see ``spread``."""
+    """(E, 2) long."""
+    start: Tensor
+    """(E,) the part from ``start`` to ``stop`` lies in the image; nothing does if they are equal."""
+    stop: Tensor
+
+    @property
+    def direction(self) -> Tensor:
+        """(E, 2) from end to end [px]."""
+        return self.ends[:, 1] - self.ends[:, 0]
+
+    @property
+    def length(self) -> Tensor:
+        """(E,) from end to end [px]."""
+        return self.direction.norm(dim=1)
+
+    @property
+    def normal(self) -> Tensor:
+        """(E, 2) unit normals in the image."""
+        x, y = self.direction.unbind(1)
+        return torch.stack([y, -x], 1) / self.length.clamp_min(1e-12)[:, None]
+
+    def position(self, line: Tensor, at: Tensor) -> Tensor:
+        """(N, 2) pixels from the image's centre of the points ``at`` (N,) on the lines with numbers ``line`` (N,)."""
+        return self.ends[line, 0] + at[:, None] * self.direction[line]
+
+    def share(self, line: Tensor, at: Tensor) -> Tensor:
+        """(N, 2) how far the point moves when the edge's first or second vertex moves, as homogeneous image points.
+
+        The motion is that along the normal n, from (n, -n . position) . d(vertex): for a vertex with image point X / z,
+        d(X / z) = (dX - X / z dz) / z, and n . X / z is the same all along the line.
+        """
+        of_ends = torch.stack([1 - at, at], 1) / self.depths[line]
+        of_vertices = torch.stack([1 - self.cut[line], self.cut[line]], 2)  # (N, end, vertex)
+        return (of_ends[..., None] * of_vertices).sum(1)
 
 
-def edge_points(points: Tensor, edges: Tensor, size: tuple[int, int], step: float) -> EdgePoints:
-    """Evenly spaced points, at most ``step`` px apart, on the seen part of edges in front of the camera.
+def lines_of(points: Tensor, edges: Tensor, size: tuple[int, int]) -> Lines:
+    """The image of edges (E, 2), as far as they are in front of the camera.
 
-    points (V, 3): homogeneous image points (``View.points``), detached; edges (E, 2).
-    An edge that crosses the near plane is cut there: any two of its points describe how its line moves in the image.
+    points (V, 3): homogeneous image points (``View.points``), detached.
     """
     ends = points[edges]
     z = ends[..., 2]
@@ -104,26 +131,9 @@ def edge_points(points: Tensor, edges: Tensor, size: tuple[int, int], step: floa
     cut = torch.stack([torch.where(z[:, 0] < NEAR, along, 0.0), torch.where(z[:, 1] < NEAR, along, 1.0)], 1)
     mixed = ends[:, :1] * (1 - cut[..., None]) + ends[:, 1:] * cut[..., None]
     mixed = torch.where((z < NEAR).any(1)[:, None, None], mixed, ends)  # uncut ones bit for bit
-    image = mixed[..., :2] / mixed[..., 2:].clamp_min(NEAR)
-    start, stop = _clip(image, size)
-    direction = image[:, 1] - image[:, 0]
-    length = direction.norm(dim=1)
-    seen = length * (stop - start)
-    counts = torch.where(seen > 0, (seen / step).ceil().clamp(1, LONGEST), 0.0).long()
-    k = torch.repeat_interleave(counts)
-    rank = torch.arange(len(k), device=k.device) - (counts.cumsum(0) - counts)[k]
-    s = start[k] + (rank + 0.5) / counts[k] * (stop - start)[k]
-    normal = torch.stack([direction[:, 1], -direction[:, 0]], 1) / length.clamp_min(1e-12)[:, None]
-    # share of the two (cut) image ends in the point's motion, and of each vertex in theirs: d image = d point_xy / z
-    ends_share = torch.stack([1 - s, s], 1) / mixed[..., 2].clamp_min(NEAR)[k]
-    share = torch.stack([1 - cut[k], cut[k]], 2)  # (N, image end, vertex)
-    return EdgePoints(
-        image[k, 0] + s[:, None] * direction[k],
-        normal[k],
-        (seen / counts.clamp_min(1))[k],
-        edges[k],
-        (ends_share[..., None] * share).sum(1),
-    )
+    depths = mixed[..., 2].clamp_min(NEAR)
+    image = mixed[..., :2] / depths[..., None]
+    return Lines(image, depths, cut, edges, *_clip(image, size))
 
 
 def _clip(image: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

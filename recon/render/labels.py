@@ -18,16 +18,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from recon.render.edges import edge_points, topology
+from recon.render.edges import lines_of, topology
+from recon.render.jumps import jumps
 from recon.render.raster import Raster
 from recon.render.view import View, Window, outcodes, view_of
 from recon.types import Camera, Mesh
-
-HAIR = 1e-5
-"""How far to either side of an edge its image is probed for a jump [px].
-
-Wider counts edges twice that nearly coincide in the image; doubles resolve 1e-12 px.
-"""
 
 
 class LabelRenderer:
@@ -39,7 +34,7 @@ class LabelRenderer:
         faces: per mesh (F_i, 3) long; open meshes are two-sided, closed ones are counter-clockwise from outside.
         labels: per mesh its row in the image, shared by meshes at will; None or -1 = only hides others.
         n_vertices: per mesh the number of vertices.
-        step: largest distance of points on silhouettes [output px]; smaller = more exact gradients, slower.
+        step: length of the pieces that silhouettes are cut into [output px], up to 1; smaller = more exact, slower.
     """
 
     def __init__(
@@ -47,7 +42,7 @@ class LabelRenderer:
         faces: Sequence[Tensor],
         labels: Sequence[int | None],
         n_vertices: Sequence[int],
-        step: float = 0.25,
+        step: float = 0.5,
     ):
         if not len(faces) == len(labels) == len(n_vertices) > 0:
             found = f"{len(faces)} meshes, {len(labels)} labels, {len(n_vertices)} vertex counts"
@@ -112,6 +107,9 @@ class LabelRenderer:
         return self._edges[candidate & ((outside[self._edges[:, 0]] & outside[self._edges[:, 1]]) == 0)]
 
 
+_SAVED = ("ahead", "behind", "row", "column", "vertices")
+
+
 class _Coverage(torch.autograd.Function):
     """(V, 3) homogeneous image points -> (L, h, w) coverage."""
 
@@ -127,23 +125,17 @@ class _Coverage(torch.autograd.Function):
         raster = Raster(points, renderer._faces[keep].int(), renderer._value[keep].int())
         image = raster.coverage(view.size, grid, renderer.n_labels)
         if ctx.needs_input_grad[0]:
-            at = edge_points(points, renderer._candidates(front, outside), view.size, renderer.step)
-            plus, minus = raster.seen_beside(at.position, HAIR * at.normal, view.size)
-            jump = plus != minus
-            pixel = (at.position + at.position.new_tensor([view.size[1] / 2, view.size[0] / 2])).floor().long()
-            column, row = pixel[:, 0].clamp(0, view.size[1] - 1), pixel[:, 1].clamp(0, view.size[0] - 1)
-            along = torch.cat([at.normal, -(at.normal * at.position).sum(1, keepdim=True)], 1)
-            motion = (at.weight[:, None] * at.share)[..., None] * along[:, None]  # (N, 2, 3): area per vertex motion
-            kept = (plus, minus, row, column, at.vertices, motion.to(homogeneous.dtype))
-            ctx.save_for_backward(*(tensor[jump] for tensor in kept))
+            lines = lines_of(points, renderer._candidates(front, outside), view.size)
+            found = jumps(raster, lines, view.size, renderer.step)
+            ctx.save_for_backward(*(getattr(found, name) for name in _SAVED), found.motion.to(homogeneous.dtype))
             ctx.n_points = len(points)
         return image.to(homogeneous.dtype)
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
-        plus, minus, row, column, vertices, motion = ctx.saved_tensors
+        ahead, behind, row, column, vertices, motion = ctx.saved_tensors
         worth = torch.cat([torch.zeros_like(gradient[:1]), gradient])  # row 0: the background and mere occluders
-        swept = worth[minus, row, column] - worth[plus, row, column]
+        swept = worth[behind, row, column] - worth[ahead, row, column]
         flow = (swept[:, None, None] * motion).reshape(-1, 3)
         out = motion.new_zeros(ctx.n_points, 3)
         if out.is_cuda:  # sorts before it adds: the same sum each time

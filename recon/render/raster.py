@@ -1,3 +1,4 @@
+# mypy: disable-error-code="valid-type,arg-type,index,operator,call-overload,misc"
 """What rays through the image hit first, by rasterising homogeneous triangles: nothing is built, so nothing to rebuild.
 
 A triangle with homogeneous image points p0, p1, p2 meets the ray (x, y, 1) at barycentric weights proportional to
