@@ -177,9 +177,15 @@ def learn(clips: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return mean, correlation * np.outer(spread, spread)
 
 
+def rest_joints() -> np.ndarray:
+    """(24, 3) T-pose joints of the embedded body [m]."""
+    body = load_body()
+    return body.rest_joints(body.neutral().shape)[0].double().numpy()
+
+
 def export(motions: Path, out: Path) -> dict:
     """Write the npz and return its card."""
-    clips = gather(motions, load_body().joints.double().numpy())
+    clips = gather(motions, rest_joints())
     mean, covariance = learn(clips)
     root = np.linalg.cholesky(covariance)
     energy = [float((np.linalg.solve(root, (c[:, 1:].reshape(len(c), 69) - mean).T) ** 2).mean()) for c in clips]
