@@ -132,7 +132,10 @@ def retarget(clip: Clip, joints: np.ndarray) -> np.ndarray:
         world[:, j] = clip.world[:, at[source]]
         if base in LIMBS:
             ours = joints[JOINT_NAMES.index(side + LIMBS[base])] - joints[j]
-            align[side] = smallest_rotation(ours, clip.offsets[at[clip_joint(side + LIMBS[base], clip.names)]])
+            end = clip_joint(side + LIMBS[base], clip.names)
+            if end is None:
+                raise SystemExit(f"{clip.name}: found {source} without the joint that it points to")
+            align[side] = smallest_rotation(ours, clip.offsets[at[end]])
         if base in LIMBS or base == "wrist" or (base == "ankle" and clip.source.startswith("CMU")):
             world[:, j] = world[:, j] @ align[side]  # hands and feet go on from the limb; but see Clip.source
     for side in ("l_", "r_"):
