@@ -1,57 +1,53 @@
-"""A binding sampled once on a lattice around the neutral body: bindings for moving vertices in milliseconds."""
+"""GAPS' participation sampled once on a lattice around the neutral body: bindings of moving vertices, quickly."""
 
 from __future__ import annotations
 
+import itertools
+
+import numpy as np
 import torch
-from scipy.spatial import cKDTree
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from recon.draping.binding import BodyField, rbf
+from recon.draping.binding import BodyField, gaps
 
-SPACING = 0.03
+SPACING = 0.025
 """Distance of lattice nodes [m]."""
+BAND = 0.15
+"""Nodes up to so far from the body [m] have features of their own; further ones share those of the nearest that has."""
 MARGIN = 0.30
 """The lattice reaches this far around the body's box [m]; further points take the border's values."""
-PARTICIPANTS = 1600
-"""Body vertices that take part; the participation of Eq. 6 is a smooth average, so a part of them says the same."""
-FAR = 0.25
-"""Nodes further than this from the body [m] make do with a tenth of the participants: no cloth hangs there."""
 
 
 class Lattice:
     """Features of a body field on a regular lattice, read by trilinear interpolation."""
 
     def __init__(self, field: BodyField):
-        """Sample GAPS' participation (``binding.rbf``) of a body field; takes a few seconds."""
-        order = torch.randperm(len(field.vertices), generator=torch.Generator().manual_seed(0)).to(
-            field.vertices.device
-        )
-        self.low = field.vertices.min(0).values - MARGIN
-        high = field.vertices.max(0).values + MARGIN
-        self.counts = ((high - self.low) / SPACING).ceil().long() + 1
-        axes = [self.low[k] + SPACING * torch.arange(int(self.counts[k]), device=self.low.device) for k in range(3)]
-        nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        body = cKDTree(field.vertices.cpu().numpy())
-        distance, _ = body.query(nodes.cpu().numpy(), distance_upper_bound=FAR)
-        near = torch.as_tensor(distance < FAR, device=nodes.device)
-        self.features = nodes.new_zeros(len(nodes), field.features.shape[1])
-        for where, count in ((near, PARTICIPANTS), (~near, PARTICIPANTS // 10)):
-            some = order[:count]
-            self.features[where] = rbf(BodyField(field.vertices[some], field.features[some]), nodes[where])
+        """Sample ``binding.gaps`` of a body field; takes a few seconds."""
+        vertices = field.vertices.cpu().double().numpy()
+        low = vertices.min(0) - MARGIN
+        counts = np.ceil((vertices.max(0) + MARGIN - low) / SPACING).astype(int) + 1
+        axes = [low[k] + SPACING * np.arange(counts[k]) for k in range(3)]
+        nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        near = np.isfinite(field.cells[0].tree.query(nodes, distance_upper_bound=BAND)[0])
+        nearest = distance_transform_edt(~near.reshape(counts), return_distances=False, return_indices=True)
+        row = (np.cumsum(near) - 1)[np.ravel_multi_index(tuple(nearest.reshape(3, -1)), counts)]
+        device = field.vertices.device
+        self.low = torch.as_tensor(low, dtype=torch.float32, device=device)
+        self.last = torch.as_tensor(counts - 1, device=device)
+        self.stride = torch.as_tensor([counts[1] * counts[2], counts[2], 1], device=device)
+        self.row = torch.as_tensor(row, device=device)
+        """(nodes,) which row of features each node reads."""
+        self.features = gaps(field, torch.as_tensor(nodes[near], dtype=torch.float32, device=device))
 
     def __call__(self, points: Tensor) -> Tensor:
         """(N, 3) points [m] -> (N, C) features, differentiable in the points."""
-        last = (self.counts - 1).to(points)
-        at = ((points - self.low) / SPACING).clamp(torch.zeros_like(last), last - 1e-3)
-        cell = at.detach().floor()
-        part = at - cell
-        base = cell.long()
-        stride = torch.stack([self.counts[1] * self.counts[2], self.counts[2], torch.ones_like(self.counts[2])])
-        total: Tensor | None = None
-        for corner in range(8):
-            step = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=points.device)
-            share = torch.where(step.bool(), part, 1 - part).prod(1, keepdim=True)
-            value = self.features[((base + step) * stride).sum(1)] * share
-            total = value if total is None else total + value
-        assert total is not None
-        return total
+        last = self.last.to(points)
+        at = ((points - self.low.to(points)) / SPACING).clamp(torch.zeros_like(last), last - 1e-3)
+        base = at.detach().floor()
+        part = at - base
+        first = (base.long() * self.stride).sum(1)
+        steps = torch.tensor(list(itertools.product((0, 1), repeat=3)), device=points.device)  # (8, 3)
+        share = torch.where(steps.bool(), part[:, None], 1 - part[:, None]).prod(2)  # (N, 8)
+        rows = self.row[first[:, None] + (steps * self.stride).sum(1)]
+        return (self.features.to(points)[rows] * share[..., None]).sum(1)
