@@ -124,10 +124,8 @@ def panel_border(garment: Garment, shape: IspShape, panel: int) -> Border:
     labels = garment.border_labels.numpy()[edges]
     sewn = ~_is_open(garment, vertex[edges])
     turns = _edge_turns(plane, edges)
-    # An edge between two seams' labels belongs to the seam beyond its straighter end: the corner is the sharper one.
-    pick = np.where(turns[:, 0] > turns[:, 1], labels[:, 1], labels[:, 0])
-    pick = np.where(labels[:, 0] == labels[:, 1], labels[:, 0], np.where((labels <= 0).any(1), labels.max(1), pick))
-    label = np.where(sewn, pick, 0)
+    # A point's label is that of the border edge which starts there; whether the edge is sewn, the welded mesh says.
+    label = np.where(sewn, np.where(labels[:, 0] > 0, labels[:, 0], labels[:, 1]), 0)
     partner = _partners(garment, panel)[edges]
     placed = np.where(sewn[:, None, None], plane[np.maximum(partner, 0)], np.nan)
     placed[(partner < 0)] = np.nan

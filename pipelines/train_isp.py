@@ -12,6 +12,7 @@ import json
 import math
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -23,7 +24,8 @@ from torch import Tensor
 
 from pipelines.isp_samples import GRID, IspSamples, collect, frame
 from recon.files.weights import write_weights
-from recon.garments.isp import IspDecoder, Variant
+from recon.garments.dataset import Item, load_items
+from recon.garments.isp import IspDecoder, Variant, load_isp
 from recon.garments.isp_net import IspNets, IspShape
 from recon.types import Garment, UserError
 
@@ -38,7 +40,9 @@ class TrainIsp:
     kind: str
     """Garment kind: top, skirt, trousers or dress."""
     data: Path | None = None
-    """Folder or file of the garment data set; the packaged one if not given."""
+    """Folder of the garment data set (<kind>_train.npz, <kind>_test.npz); the one that ships if not given."""
+    start: Path | None = None
+    """Folder of weights to go on from (the same kind and network sizes); None = from scratch."""
     out: Path = Path("out/weights")
     """Folder for the weights, their manifest, the log and the checkpoints."""
     minutes: float = 20.0
@@ -51,19 +55,19 @@ class TrainIsp:
     """CPU threads."""
     garments: int = 0
     """Train on the first so many garments only; 0 = all."""
-    batch: int = 16
+    batch: int = 8
     """Garments per step."""
-    surface_points: int = 144
+    surface_points: int = 96
     """Places per garment and step at which the surface map is compared (three points each, both panels)."""
-    border_points: int = 48
+    border_points: int = 32
     """Border points and seam points per garment and step."""
-    pattern_points: int = 448
+    pattern_points: int = 320
     """Signed distance samples per garment and step."""
     rate: float = 2e-3
     """Adam's learning rate of the networks at the start; decays along a cosine."""
     code_rate: float = 2e-3
     """The same for the codes."""
-    width: int = 256
+    width: int = 192
     """Units per layer."""
     pattern_depth: int = 4
     """Layers of I_Θ."""
@@ -94,42 +98,67 @@ def train_isp(config: TrainIsp) -> Path:
     Raises:
         UserError: no garments of this kind.
     """
-    from recon.garments.dataset import load_garments  # not needed by those who bring their own garments
-
-    source = config.data if config.data is not None else config.kind
-    everything = load_garments(source, split="train")
-    garments = [g for g in everything if g.kind == config.kind][: config.garments or None]
+    items = _items(config, "train")[: config.garments or None]
+    garments = [item.garment for item in items]
     if not garments:
-        raise UserError(f"{source}: no garments of kind {config.kind} to train on; make a data set first")
-    decoder, done = learn(garments, config)
+        raise UserError(f"{config.data or config.kind}: no garments of kind {config.kind} to train on")
+    decoder, done = learn(garments, config, [item.parameters for item in items])
     metrics: dict[str, object] = {}
     if config.evaluate:
         from pipelines.eval_isp import evaluate
 
-        unseen = [g for g in load_garments(source, split="test") if g.kind == config.kind][: config.evaluate]
+        unseen = [item.garment for item in _items(config, "test")[: config.evaluate]]
         metrics = evaluate(decoder, garments[: config.evaluate], unseen)
     return store(decoder, config, done, metrics)
 
 
-def learn(garments: list[Garment], config: TrainIsp) -> tuple[IspDecoder, Progressing]:
-    """The training itself, for garments of one kind in memory."""
+def _items(config: TrainIsp, split: str) -> list[Item]:
+    source = config.kind if config.data is None else config.data / f"{config.kind}_{split}.npz"
+    return [item for item in load_items(source, split) if item.garment.kind == config.kind]
+
+
+def learn(
+    garments: list[Garment], config: TrainIsp, parameters: Sequence[dict[str, float]] = ()
+) -> tuple[IspDecoder, Progressing]:
+    """The training itself, for garments of one kind in memory; ``parameters`` they were cut with, where known."""
     torch.set_num_threads(config.threads)
     config.out.mkdir(parents=True, exist_ok=True)
-    shape = replace(
-        frame(garments, config.code),
-        width=config.width,
-        pattern_depth=config.pattern_depth,
-        surface_depth=config.surface_depth,
-    )
+    earlier = load_isp(config.kind, config.start) if config.start is not None else None
+    shape = earlier.nets.shape if earlier is not None else _shape(garments, config)
     samples = collect(garments, shape, np.random.default_rng(config.seed), STEP)
     state = _start(samples, shape, config)
+    if earlier is not None:
+        state.nets.load_state_dict(earlier.nets.state_dict())
+        with torch.no_grad():
+            state.codes.copy_(known_codes(earlier, samples))
     checkpoint = config.out / f"isp-{config.kind}.checkpoint"
     _resume(state, checkpoint, config, len(garments))
     generator = torch.Generator().manual_seed(config.seed + state.step)
     _descend(state, samples, config, generator, checkpoint)
     checkpoint.unlink(missing_ok=True)
-    variants = [Variant(g.variant, dict(getattr(g, "parameters", None) or {})) for g in garments]
+    known = parameters or [{}] * len(garments)
+    variants = [Variant(g.variant, dict(p)) for g, p in zip(garments, known, strict=True)]
     return IspDecoder(state.nets, state.codes.detach().clone(), variants), state
+
+
+def _shape(garments: list[Garment], config: TrainIsp) -> IspShape:
+    return replace(
+        frame(garments, config.code),
+        width=config.width,
+        pattern_depth=config.pattern_depth,
+        surface_depth=config.surface_depth,
+    )
+
+
+@torch.no_grad()
+def known_codes(decoder: IspDecoder, samples: IspSamples, count: int = 256) -> Tensor:
+    """For each garment the earlier code whose panels are closest: (n, z)."""
+    fields = [decoder.nets.pattern.fold(z) for z in decoder.codes]
+    best = []
+    for at, distance in zip(samples.at[:, ::41][:, :count], samples.distance[:, ::41][:, :count], strict=True):
+        off = [(decoder.nets.pattern.run_folded(field, at)[:, :2] - distance).abs().mean() for field in fields]
+        best.append(int(torch.stack(off).argmin()))
+    return decoder.codes[best]
 
 
 def _start(samples: IspSamples, shape: IspShape, config: TrainIsp) -> Progressing:
@@ -311,7 +340,7 @@ def store(decoder: IspDecoder, config: TrainIsp, done: Progressing, metrics: dic
         "what": f"implicit sewing patterns, {config.kind} (ISP networks I_Θ and A_Φ and {len(decoder.codes)} codes)",
         "shape": asdict(decoder.nets.shape),
         "variants": decoder.variants,
-        "parameters": decoder.parameters,
+        "parameters": [{k: round(v, 4) for k, v in p.items()} for p in decoder.parameters],
         "data": f"{len(decoder.codes)} generated garments of kind {config.kind}",
         "seed": config.seed,
         "steps": done.step,
