@@ -10,13 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipelines.evidence import Level, level
+from pipelines.evidence import level
 from pipelines.fit_body import BodyFit, evidence_loss, to_body, to_camera
+from recon.bodies import Body
 from recon.cloth.contact import BodyContact
 from recon.descend import Descent, descend
-from recon.garments.latents import LatentPrior, of_variants
+from recon.draping import Draper
+from recon.garments import GarmentDecoder
+from recon.garments.latents import LatentPrior, nearest, of_variants, spread
 from recon.losses import chamfer_pull, depth_penalty, hard_iou, soft_iou_loss
-from recon.types import Camera, Garment, Photo, PosedBody
+from recon.types import Camera, Garment, Photo, PosedBody, UserError
 
 
 @dataclass(frozen=True)
@@ -27,14 +30,18 @@ class GarmentFit:
     """(pixels on the longer side, most steps) from coarse to fine."""
     resolution: int = 96
     """Decoding resolution while the code descends."""
-    final_resolution: int = 128
+    final_resolution: int = 104
     """Decoding resolution of the garment that the stage ends with."""
     retrieval_resolution: int = 48
     """Decoding resolution of the codes that retrieval compares."""
     retrieval_pixels: int = 96
     """Longer side of retrieval's silhouettes."""
+    retrieval_round: int = 60
+    """Codes that retrieval's first round compares; its second compares as many neighbours of the best."""
     starts: int = 2
     """How many of the best retrieved codes get a first, coarse descent; the best goes on."""
+    refresh: int = 5
+    """Steps for which a garment's topology is kept while its code descends."""
     latent_rate: float = 0.06
     """Step size of the code in standard deviations of the learned codes."""
     mahalanobis: float = 0.01
@@ -66,9 +73,9 @@ class Layer:
 class Models:
     """Everything learned or measured that the stages use."""
 
-    body: object
-    draper: object
-    decoders: dict[str, object]
+    body: Body
+    draper: Draper
+    decoders: dict[str, GarmentDecoder]
     """Garment name -> decoder of its kind."""
     variants: dict[str, tuple[str, ...]]
     """Garment name -> variants of the kind that the name allows."""
@@ -100,30 +107,44 @@ def retrieve(
 ) -> Tensor:
     """Codes by the overlap of their draped silhouettes with the mask, best first.
 
-    Pixels under an outer garment's mask count neither for nor against, like hair and hands.
+    A first round looks at codes that cover all allowed ones, a second at the neighbours of its best: with few codes that
+    is all of them. Pixels under an outer garment's mask count neither for nor against, like hair and hands.
 
     Returns:
         (n,) indices into the decoder's codes, best first.
     """
+    decoder = models.decoders[name]
+    allowed = of_variants(decoder.variants, models.variants[name])
+    with torch.no_grad():
+        score = _silhouette_score(name, values, photo, models, settings)
+        scores = {int(i): score(int(i)) for i in spread(decoder.codes, settings.retrieval_round, allowed)}
+        best = sorted(scores, key=scores.__getitem__, reverse=True)[:3]
+        for index in best:
+            near = nearest(decoder.codes[allowed], decoder.codes[index], settings.retrieval_round // 3)
+            scores |= {i: score(i) for i in allowed[near].tolist() if i not in scores}
+    if tick:
+        tick(len(scores), 1 - max(scores.values()))
+    return torch.tensor(sorted(scores, key=scores.__getitem__, reverse=True))
+
+
+def _silhouette_score(
+    name: str, values: dict[str, Tensor], photo: Photo, models: Models, settings: GarmentFit
+) -> Callable:
+    """A function from a code's index to its silhouette's overlap with the mask."""
     at = level(photo, settings.retrieval_pixels)
     mine = at.names.index(name)
-    hidden = at.targets[:mine].sum(0).clamp(0, 1)
-    weight = at.weight * (1 - hidden)
+    weight = at.weight * (1 - at.targets[:mine].sum(0).clamp(0, 1))
     camera = at.camera(to_camera(values, photo_size(photo)))
     decoder = models.decoders[name]
-    indices = of_variants(decoder.variants, models.variants[name])
-    scores = torch.zeros(len(indices))
-    with torch.no_grad():
-        posed = models.body.pose(to_body(values))
-        for k, index in enumerate(indices):
-            garment = decoder.decode(decoder.codes[index], settings.retrieval_resolution)
-            draped = models.draper.drape(garment, posed).vertices[0]
-            pixels = camera.project(draped).numpy()
-            drawn = silhouette(pixels, garment.mesh.faces.numpy(), at.size)
-            scores[k] = hard_iou(drawn[None].float(), at.targets[mine][None], weight)[0]
-            if tick:
-                tick(k, float(scores[k]))
-    return indices[scores.argsort(descending=True)]
+    posed = models.body.pose(to_body(values))
+
+    def score(index: int) -> float:
+        garment = decoder.decode(decoder.codes[index], settings.retrieval_resolution)
+        pixels = camera.project(models.draper.drape(garment, posed).vertices[0])
+        drawn = silhouette(pixels.cpu().numpy(), garment.mesh.faces.cpu().numpy(), at.size)
+        return float(hard_iou(drawn[None].float(), at.targets[mine][None], weight)[0])
+
+    return score
 
 
 def scene_images(
@@ -152,15 +173,34 @@ class GarmentLoss:
         self.decoder = models.decoders[name]
         self.prior = LatentPrior.of(self.decoder.codes[of_variants(self.decoder.variants, models.variants[name])])
         self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
+        self._shape: Garment | None = None
+        self._cut_at, self._age = self.decoder.codes[0], 0
+        self._reach = 0.3 * self.decoder.codes.std(0).norm().item()
         on = torch.nonzero(self.at.targets[-1] > 0.5)
         chosen = torch.linspace(0, max(len(on) - 1, 0), min(len(on), 400)).long()
         self.targets = on[chosen].flip(1).to(torch.float32) + 0.5
+
+    def _decode(self, latent: Tensor) -> Garment:
+        """The code's garment: topology is kept for a few steps, since cutting and sewing cost most of a decode."""
+        moved = self._shape is None or (latent.detach() - self._cut_at).norm() > self._reach
+        if moved or self._age >= self.settings.refresh:
+            self._shape, self._cut_at, self._age = (
+                self.decoder.decode(latent, self.settings.resolution),
+                latent.detach(),
+                0,
+            )
+            return self._shape
+        self._age += 1
+        return self.decoder.decode_like(latent, self._shape)
 
     def __call__(self, values: dict[str, Tensor]) -> Tensor:
         s, models = self.settings, self.models
         posed = models.body.pose(to_body(values))
         camera = self.at.camera(to_camera(values, photo_size(self.photo)))
-        garment = self.decoder.decode(values["latent"], s.resolution)
+        try:
+            garment = self._decode(values["latent"])
+        except UserError:  # the code left what garments look like: descend goes back to the best
+            return values["latent"].sum() * float("nan")
         mine = models.draper.drape(garment, posed).vertices[0]
         layers = [(models.draper.drape(o.garment, posed).vertices[0], o.garment.mesh.faces) for o in self.outer]
         image = scene_images(posed, [*layers, (mine, garment.mesh.faces)], camera, self.at.size, models)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -99,8 +99,20 @@ def fit_photo(config: PhotoFit, say: Say | None = None, tick=None) -> FitResult:
     models = load_models(config.garments, config)
     run = open_run(config, masks, say)
     photo = run.stage("perceive", perceive, rgb, config.garments, config.person, masks)
+    photo = worn(photo)
     fitted = fit_evidence(to_device(photo, torch.device(config.device)), models, config, run, tick)
     return write_results(config, photo, models, fitted, run.seconds)
+
+
+def worn(photo: Photo) -> Photo:
+    """The photo without garments that perception did not find, each with a note; UserError when none is left."""
+    area = photo.rgb.shape[0] * photo.rgb.shape[1]
+    found = {name: mask for name, mask in photo.garments.items() if mask.sum() >= 2e-4 * area}
+    missing = [name for name in photo.garments if name not in found]
+    if not found:
+        raise UserError(f"photo: found no pixels of {', '.join(missing)}; wanted one garment at least (try --masks)")
+    notes = [f"{name}: not found in the photo, left out" for name in missing]
+    return replace(photo, garments=found, notes=(*photo.notes, *notes))
 
 
 def open_run(config: PhotoFit, masks: dict[str, Tensor] | None, say: Say | None) -> Run:

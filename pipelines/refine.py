@@ -174,7 +174,7 @@ def refine(
         return physics(free) + settings.evidence * soft_iou_loss(image, at.targets, at.weight).sum()
 
     free = {p.layer.name: p.smooth.encode(p.start) for p in pieces}
-    sizes = {name: settings.step for name in free}
+    sizes = dict.fromkeys(free, settings.step)
     free = descend(free, sizes, physics, settings.settle, tick).values
     free = descend(free, sizes, with_evidence, settings.match, tick).values
     ends = {}
