@@ -17,7 +17,7 @@ wp.config.quiet = True
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 DEVICE = "cpu"
-CONTACT_REACH = 0.08
+CONTACT_REACH = 0.06
 """Body contact is searched for within this distance of a vertex [m]."""
 
 
@@ -27,11 +27,11 @@ class Settings:
 
     step: float = 1 / 2000
     """Substep [s]."""
-    fit_steps: int = 400
+    fit_steps: int = 300
     """Substeps without gravity, strongly damped: the placed pillow shrinks onto the body."""
-    fall_steps: int = 1000
+    fall_steps: int = 800
     """Substeps with gravity, hardly damped."""
-    rest_steps: int = 600
+    rest_steps: int = 300
     """Substeps with gravity, strongly damped: the motion ends."""
     stretch_compliance: float = 1e-7
     """Compliance of the edges (unit masses)."""
@@ -60,7 +60,7 @@ class Constraints:
     rest: NDArray
     """(V, 3) positions in the pattern, panels far apart: tells neighbours from strangers in self contact [m]."""
     held: NDArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    """(H,) vertices that keep their height (a waistband)."""
+    """(H,) vertices of a waistband, held level at its mean height."""
     side: NDArray | None = None
     """(V,) 1 left leg, -1 right leg, 0 neither: legs keep to their side of the body's middle plane."""
 
@@ -175,8 +175,8 @@ def settle(start: NDArray, constraints: Constraints, body: wp.Mesh, settings: Se
     s = settings or Settings()
     cloth, pairs = _allocate(start, constraints, s)
     state = _State(cloth, pairs, len(start), constraints, body, s)
-    _run(state, s.fit_steps, gravity=0.0, damping=0.96, friction=0.02, search=5, limit=1.5)
-    _run(state, s.fall_steps, gravity=9.81, damping=0.997, friction=s.friction, search=12, limit=3.0)
+    _run(state, s.fit_steps, gravity=0.0, damping=0.96, friction=0.02, search=8, limit=1.5)
+    _run(state, s.fall_steps, gravity=9.81, damping=0.997, friction=s.friction, search=16, limit=3.0)
     _run(state, s.rest_steps, gravity=9.81, damping=0.97, friction=s.friction, search=20, limit=3.0)
     return cloth.x.numpy().astype(np.float64)
 
@@ -216,6 +216,11 @@ def _search_self(state: _State) -> int:
     return len(pairs)
 
 
+def held_height(x: NDArray, held: NDArray) -> float:
+    """The level at which a waistband ``held`` (H,) of ``x`` (V, 3) is worn: its mean height [m]."""
+    return float(x[held, 1].mean()) if len(held) else 0.0
+
+
 def close_strangers(x: NDArray, rest: NDArray, distance: float) -> NDArray:
     """(K, 2) vertex pairs closer than ``distance`` in space but further than 2.5 times that in the pattern."""
     from scipy.spatial import cKDTree
@@ -245,7 +250,7 @@ def _allocate(start: NDArray, constraints: Constraints, s: Settings) -> tuple[_C
     cloth.length = floats(np.concatenate([constraints.edge_lengths, constraints.bend_lengths]))
     cloth.compliance = floats(compliance)
     cloth.held = wp.array(constraints.held.astype(np.int32), dtype=int, device=DEVICE)
-    cloth.held_y = floats(start[constraints.held, 1])
+    cloth.held_y = floats(np.full(len(constraints.held), held_height(start, constraints.held)))
     cloth.side = floats(side)
     cloth.near = wp.zeros(20 * n, dtype=wp.vec2i, device=DEVICE)
     cloth.near_length = wp.zeros(20 * n, dtype=float, device=DEVICE)

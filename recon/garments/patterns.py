@@ -26,6 +26,8 @@ from recon.types import Garment, Mesh
 
 EDGE_LENGTH = 0.0135
 """Wanted edge length of the triangles [m]."""
+QUANTUM = 5e-5
+"""Panel points are whole multiples of this, as the data set stores them [m]."""
 MAX_VERTICES = 3500
 """Large garments get longer edges, so that about this many vertices suffice."""
 
@@ -123,7 +125,7 @@ def cut(variant: str, parameters: dict[str, float], edge_length: float | None = 
             panel_p.append(np.full(len(mesh.points), panel))
             labels.append(label)
             offset += len(mesh.points)
-    points = np.concatenate(points)
+    points = np.round(np.concatenate(points) / QUANTUM) * QUANTUM
     seams = np.unique(np.concatenate([np.stack([runs[0][k], runs[1][k]], 1) for k in runs[0]]), axis=0)
     if np.abs(points[seams[:, 0]] - points[seams[:, 1]]).max() > 1e-9:
         raise ValueError("front and back seams differ")

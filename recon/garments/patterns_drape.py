@@ -13,13 +13,15 @@ from recon.cloth.energies import Cloth, Fabric, stretch
 from recon.cloth.intersections import self_intersections
 from recon.cloth.solve import polish
 from recon.cloth.xpbd import Constraints, body_mesh, settle
-from recon.garments.patterns import Pattern, weld, welded
+from recon.garments.patterns import Pattern, weld
 from recon.garments.patterns_body import Measures
 from recon.garments.patterns_place import BodyRelief
 from recon.types import Garment
 
 STRETCH_LIMIT = 1.03
 """95th percentile of the triangles' largest stretch that the gate lets pass."""
+QUANTUM = 5e-5
+"""Positions are whole multiples of this, as the data set stores them [m]."""
 POLISH_FABRIC = Fabric().scaled(stretch=50.0, bending=2.0)
 """Ready-to-wear cloth hardly stretches under its own weight; SNUG's cotton would sag by several percent."""
 
@@ -68,8 +70,7 @@ class FittingRoom:
         self.measures = measures
         self.relief = BodyRelief.of(measures)
         self.mesh = body_mesh(measures.vertices, measures.faces)
-        vertices = torch.tensor(measures.vertices, dtype=torch.float32)
-        self.contact = BodyContact(vertices, torch.tensor(measures.faces))
+        self.contact = BodyContact(torch.tensor(measures.vertices), torch.tensor(measures.faces))
 
     def drape(self, pattern: Pattern) -> Garment:
         """The garment at rest on the body; (V, 3) float32 vertices."""
@@ -77,17 +78,11 @@ class FittingRoom:
         cloth = Cloth.from_garment(garment, POLISH_FABRIC)
         limits = constraints(pattern, garment, cloth)
         rest = settle(garment.mesh.vertices.numpy(), limits, self.mesh)
-        start = torch.tensor(rest, dtype=torch.float32)
-        side = np.zeros(len(rest)) if limits.side is None else limits.side
-        vertices = polish(
-            cloth,
-            start,
-            self.contact,
-            rest=torch.tensor(limits.rest, dtype=torch.float32),
-            held=torch.tensor(limits.held),
-            side=torch.tensor(side, dtype=torch.float32),
-        )
-        return replace(garment, mesh=garment.mesh.with_vertices(vertices))
+        cloth = Cloth.from_garment(replace(garment, panel_points=garment.panel_points.double()), POLISH_FABRIC)
+        vertices = polish(cloth, rest, self.contact, limits)
+        # Judged as it is stored: whole quanta.
+        vertices = np.round(vertices / QUANTUM) * QUANTUM
+        return replace(garment, mesh=garment.mesh.with_vertices(torch.tensor(vertices, dtype=torch.float32)))
 
     def judge(self, garment: Garment) -> Verdict:
         """Look at a draped garment."""
@@ -100,7 +95,25 @@ class FittingRoom:
             int(self.contact.penetrating(x[garment.mesh.faces].mean(1)).sum()),
             float(torch.quantile(stretch(cloth, x), 0.95)),
             len(self_intersections(x, garment.mesh.faces)),
+            self._ugly(garment),
         )
+
+    def _ugly(self, garment: Garment) -> str:
+        """What no wearer would accept though the numbers are fine: off the shoulders, or crumpled."""
+        x = garment.mesh.vertices
+        corners, flat = x[garment.mesh.faces], garment.panel_points[garment.panel_faces]
+        area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(dim=1).sum()
+        edges = flat[:, 1:] - flat[:, :1]
+        if area < 0.93 * torch.linalg.det(edges).abs().sum():
+            return "crumpled"
+        shoulders = [i for i, name in enumerate(garment.seam_names) if name.startswith("shoulder")]
+        if shoulders:
+            on = torch.isin(garment.border_labels, torch.tensor(shoulders))
+            points, y = garment.panel_points[on], x[garment.vertex_of_point[on], 1]
+            inner = points[:, 0].abs() < self.measures.shoulder[0]
+            if (points[inner, 1] - y[inner]).max() > 0.06:
+                return "off the shoulders"
+        return ""
 
 
 def constraints(pattern: Pattern, garment: Garment, cloth: Cloth) -> Constraints:
@@ -155,6 +168,3 @@ def _leg_sides(pattern: Pattern, vertex: NDArray) -> NDArray:
     below = pattern.points[:, 1] < pattern.parameters["crotch_y"]
     out[vertex[below]] = np.sign(pattern.points[below, 0])
     return out
-
-
-__all__ = ["FittingRoom", "Verdict", "constraints", "welded"]

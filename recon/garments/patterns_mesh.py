@@ -68,6 +68,10 @@ def triangulate(border: list[Edge], edge_length: float) -> PanelMesh:
         points = _relax(points, faces, len(loop), loop, edge_length)
     faces = _delaunay(points, loop)
     _check(points, faces, loop)
+    # Smallest corner first, faces in its order: neighbours in the list are neighbours in the cloth.
+    first = faces.argmin(1)
+    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, 1)
+    faces = faces[np.lexsort((faces[:, 2], faces[:, 1], faces[:, 0]))]
     return PanelMesh(points, faces, runs)
 
 

@@ -52,7 +52,7 @@ def bodice(p: dict[str, float]) -> Outline:
     """
     out: Outline = {}
     neck = np.array([p["neck_x"], p["neck_y"]])
-    side = through(_side_points(p), 1)
+    side = bodice_side(p)
     armpit = side[-1]
     for panel in ("front", "back"):
         depth = p[f"neck_depth_{panel}"]
@@ -71,6 +71,11 @@ def bodice(p: dict[str, float]) -> Outline:
     return out
 
 
+def bodice_side(p: dict[str, float]) -> NDArray:
+    """(N, 2) left side seam of a bodice, from the hem up."""
+    return through(_side_points(p), 1)
+
+
 def _side_points(p: dict[str, float]) -> list[NDArray]:
     points = [np.array([p["hem_x"], p["hem_y"]])]
     for name in ("hip", "yoke", "waist"):
@@ -83,7 +88,7 @@ def _sleeve(p: dict[str, float], neck: NDArray, armpit: NDArray) -> list[Edge]:
     """From the armpit up to the neck: underarm seam, cuff, shoulder seam; or an armhole where there is no sleeve."""
     if p["sleeve_x"] <= 0:
         end = np.array([p["strap_x"], p["strap_y"]])
-        hole = bezier(armpit, [end[0] - 0.004, armpit[1] + 0.015], end)
+        hole = bezier(armpit, [end[0] - 0.004, armpit[1] + 0.03], end)
         return [Edge("open", hole), Edge("shoulder_left", np.stack([end, neck]))]
     cuff_top = np.array([p["sleeve_x"], p["sleeve_y"]])
     cuff_low = cuff_top - [0.0, p["cuff_height"]]
@@ -127,18 +132,23 @@ def _cut_open(edges: list[Edge], line: NDArray, hem: NDArray, gap: float) -> lis
 
 def skirt(p: dict[str, float]) -> Outline:
     """Skirt: waistband, side seams, hem."""
-    waist = np.array([p["waist_x"], p["waist_y"]])
-    points = [np.array([p["hem_x"], p["hem_y"]])]
-    if p["hem_y"] < p["hip_y"] - 0.04:
-        points.append(np.array([p["hip_x"], p["hip_y"]]))
-    side = through(points + [_yoke(p), waist], 1)
+    side = skirt_side(p)
+    waist = side[-1]
     hem = _hem(p, side[0])
     bottom = np.concatenate([(hem * [-1, 1])[::-1], hem[1:]])
     out: Outline = {}
     for panel in ("front", "back"):
-        band = _waistband(waist, p["waist_drop_front"] if panel == "front" else p["waist_drop_back"])
+        band = _waistband(waist, p["waist_drop"])
         out[panel] = [[Edge("open", bottom), Edge("side_left", side), band, *mirrored([Edge("side_left", side)])]]
     return out
+
+
+def skirt_side(p: dict[str, float]) -> NDArray:
+    """(N, 2) left side seam of a skirt, from the hem up."""
+    points = [np.array([p["hem_x"], p["hem_y"]])]
+    if p["hem_y"] < p["hip_y"] - 0.04:
+        points.append(np.array([p["hip_x"], p["hip_y"]]))
+    return through(points + [_yoke(p), np.array([p["waist_x"], p["waist_y"]])], 1)
 
 
 def _yoke(p: dict[str, float]) -> NDArray:
@@ -153,7 +163,7 @@ def _waistband(waist: NDArray, drop: float) -> Edge:
 def trousers(p: dict[str, float]) -> Outline:
     """Trousers or shorts: waistband, side seams, hems, inseams that meet in a rounded crotch."""
     waist = np.array([p["waist_x"], p["waist_y"]])
-    outer = np.array([p["hem_outer_x"], p["hem_y"]])
+    outer = np.array([p["hem_outer_x"], p["hem_y"] + p["hem_rise"]])
     inner = np.array([p["hem_inner_x"], p["hem_y"]])
     crotch = np.array([0.0, p["crotch_y"]])
     points = [outer]
@@ -171,6 +181,6 @@ def trousers(p: dict[str, float]) -> Outline:
     half = [Edge("inseam_left", inseam), Edge("open", np.stack([inner, outer])), Edge("side_left", side)]
     out: Outline = {}
     for panel in ("front", "back"):
-        band = _waistband(waist, p["waist_drop_front"] if panel == "front" else p["waist_drop_back"])
+        band = _waistband(waist, p["waist_drop"])
         out[panel] = [[*half, band, *mirrored(half)]]
     return out

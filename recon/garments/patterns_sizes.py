@@ -7,7 +7,9 @@ what a garment is wider than the body; with two panels a girth g needs a half wi
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from recon.garments import patterns_shapes as shapes
 from recon.garments.patterns_body import Measures
 
 Parameters = dict[str, float]
@@ -19,7 +21,7 @@ SKIN = 2 * np.pi * 0.0035
 def top(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a tank, tshirt, shirt or jacket."""
     fit = rng.beta(1.1, 1.3)
-    low, high = {"tank": (0.004, 0.045), "tshirt": (0.006, 0.075), "shirt": (0.007, 0.085), "jacket": (0.025, 0.095)}[
+    low, high = {"tank": (0.022, 0.055), "tshirt": (0.023, 0.082), "shirt": (0.023, 0.090), "jacket": (0.030, 0.095)}[
         variant
     ]
     p = _shoulders(variant, rng, m, fit, low + fit * (high - low))
@@ -39,7 +41,8 @@ def top(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
         p["hem_x"] = max(need, need + 0.25 * ease)
     else:
         p["hem_x"] = max(need, p["chest_x"] + rng.uniform(-0.012, 0.02) + max(0.0, rng.normal(0.0, 0.02)))
-    _waist(p, rng, m, fitted=rng.uniform(0, 1) * (1 - fit))
+    _waist(p, rng, m, fitted=rng.uniform(0, 0.8) * (1 - fit))
+    _clear(p, m, shapes.bodice_side(p), 0.005)
     p["hem_drop"] = float(np.clip(0.15 * (p["hem_x"] - p["waist_x"]) + rng.uniform(-0.004, 0.012), 0.0, 0.03))
     return p
 
@@ -48,7 +51,7 @@ def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a one-piece dress: sleeveless, short or long sleeves, mini to maxi, fitted to loose."""
     fit = rng.beta(1.0, 1.6)
     style = rng.choice(["tank", "tshirt", "shirt"], p=[0.4, 0.35, 0.25])
-    p = _shoulders(style, rng, m, fit, 0.005 + 0.05 * fit)
+    p = _shoulders(style, rng, m, fit, 0.022 + 0.05 * fit)
     p["hem_y"] = _pick(
         rng,
         [
@@ -64,6 +67,7 @@ def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     _waist(p, rng, m, fitted=rng.uniform(0.2, 1.0) * (1 - 0.7 * fit))
     p["hem_drop"] = 0.28 * (p["hem_x"] - p["hip_x"]) * rng.uniform(0.6, 1.1)
     _yoke(p, m)
+    _clear(p, m, shapes.bodice_side(p) if "chest_x" in p else shapes.skirt_side(p), 0.005)
     return p
 
 
@@ -85,6 +89,7 @@ def skirt(rng: np.random.Generator, m: Measures) -> Parameters:
     p["hem_x"] = max(_trunk(m, p["hem_y"]) + 0.012, p["hip_x"] + flare * (m.hip_y - p["hem_y"]))
     p["hem_drop"] = 0.28 * max(0.0, p["hem_x"] - p["hip_x"]) * rng.uniform(0.6, 1.1)
     _yoke(p, m)
+    _clear(p, m, shapes.bodice_side(p) if "chest_x" in p else shapes.skirt_side(p), 0.005)
     return p
 
 
@@ -96,8 +101,8 @@ def trousers(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     p["crotch_y"] = p["waist_y"] - half_path - rng.uniform(0.078, 0.09) - 0.03 * fit
     p["crotch_radius"] = rng.uniform(0.014, 0.018)
     p["hip_y"] = m.hip_y
-    p["hip_x"] = _trunk(m, m.hip_y) + 0.007 + 0.05 * fit
-    ease = 0.009 + 0.045 * fit
+    p["hip_x"] = _trunk(m, m.hip_y) + 0.012 + 0.05 * fit
+    ease = 0.017 + 0.04 * fit
     p["thigh_y"] = p["crotch_y"] - 0.04
     p["thigh_outer_x"] = p["crotch_radius"] + (m.leg.girth_at(m.crotch_y - 0.06) + SKIN) / 2 + ease
     if variant == "shorts":
@@ -105,7 +110,7 @@ def trousers(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     else:
         long, cropped = (m.ankle_y + 0.012, m.ankle_y + 0.07), (m.ankle_y + 0.10, m.knee_y - 0.12)
         p["hem_y"] = _pick(rng, [(0.75, *long), (0.25, *cropped)])
-    knee_ease = (0.6 + 0.6 * fit) * ease + rng.uniform(0.002, 0.014)
+    knee_ease = (0.6 + 0.6 * fit) * ease + rng.uniform(0.004, 0.012)
     if variant == "shorts":
         hem_ease = ease + rng.uniform(0.0, 0.015) + 0.03 * fit * rng.random()
     else:
@@ -113,6 +118,8 @@ def trousers(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
         hem_ease = rng.choice([rng.uniform(0.006, 0.018), straight, flared])
     _legs(p, m, knee_ease, float(hem_ease), drift=rng.uniform(-0.01, 0.05))
     _yoke(p, m)
+    p["crotch_y"] -= 0.9 * p["waist_drop"]
+    p["hem_rise"] = 0.9 * p["waist_drop"]  # a level waistband lowers the sides
     return p
 
 
@@ -148,10 +155,24 @@ def _leg(m: Measures, y: float) -> float:
     return float(m.leg.girth_at(y) + SKIN) / 4
 
 
+def _clear(p: Parameters, m: Measures, side: NDArray, least: float) -> None:
+    """Widen the whole side (N, 2) by what it lacks anywhere to go round the trunk with ``least`` to spare."""
+    heights = np.arange(max(side[:, 1].min(), m.crotch_y + 0.02), side[:, 1].max(), 0.01)
+    order = np.argsort(side[:, 1])
+    have = np.interp(heights, side[order, 1], side[order, 0])
+    lack = float(np.max(m.trunk.girth_at(heights) / 4 + SKIN / 4 + least - have, initial=0.0))
+    for name in ("chest_x", "waist_x", "yoke_x", "hip_x", "hem_x"):
+        if name in p and not (name == "waist_x" and "chest_x" not in p):
+            p[name] += lack
+
+
 def _yoke(p: Parameters, m: Measures) -> None:
     """A size between waist and hip, where bodies are wider than a straight line."""
     p["yoke_y"] = 0.5 * (p["waist_y"] + p["hip_y"])
-    p["yoke_x"] = max(0.45 * p["waist_x"] + 0.55 * p["hip_x"], _trunk(m, p["yoke_y"]) + 0.008)
+    p["yoke_x"] = max(0.45 * p["waist_x"] + 0.55 * p["hip_x"], _trunk(m, p["yoke_y"]) + 0.013)
+    if "waist_drop" in p:
+        # Hips make a cone of the cloth below a waistband. Laid flat, a level waistband is an arc at right angles to the sides.
+        p["waist_drop"] = 0.5 * p["waist_x"] * (p["yoke_x"] - p["waist_x"]) / (p["waist_y"] - p["yoke_y"])
 
 
 def _waistband(rng: np.random.Generator, m: Measures, low: float) -> Parameters:
@@ -159,9 +180,8 @@ def _waistband(rng: np.random.Generator, m: Measures, low: float) -> Parameters:
     y = rng.uniform(m.hip_y + low, m.waist_y)
     return {
         "waist_y": y,
-        "waist_x": _trunk(m, y) + rng.uniform(0.004, 0.009),
-        "waist_drop_front": rng.uniform(0.0, 0.012),
-        "waist_drop_back": rng.uniform(-0.008, 0.004),
+        "waist_x": _trunk(m, y) + rng.uniform(0.006, 0.011),
+        "waist_drop": 0.0,
     }
 
 
@@ -192,7 +212,7 @@ def _shoulders(style: str, rng: np.random.Generator, m: Measures, fit: float, ea
         p["strap_y"] = _over(m, p["strap_x"]) + 0.003
         p["armpit_y"] = _over(m, p["chest_x"]) - _arm(m, p["chest_x"]) - rng.uniform(0.008, 0.035) - 0.03 * fit
         return p
-    arm_ease = 0.010 + 0.07 * fit + rng.uniform(0.0, 0.015)
+    arm_ease = 0.016 + 0.065 * fit + rng.uniform(0.0, 0.015)
     p["shoulder_x"] = float(m.shoulder[0])
     p["shoulder_y"] = _over(m, p["shoulder_x"]) + 0.005 + 0.01 * fit
     if style == "tshirt":
