@@ -83,7 +83,7 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
 
 
 def run_truth(cases: int, out: Path) -> dict:
-    """Fit every case; IoU and symmetric point-to-surface distance after moving the pelvis onto the true one, per kind."""
+    """Fit every case; per kind IoU and symmetric point-to-surface distance, the pelvis moved onto the true one."""
     import shutil
 
     names = tuple(dict.fromkeys(n for outfit in OUTFITS for n in outfit))

@@ -32,7 +32,7 @@ def evaluate(decoder: IspDecoder, seen: list[Garment], unseen: list[Garment], se
         pairs["unseen_from_pattern"] = [(fit_pattern(decoder, g, seed=seed), g) for g in unseen]
         bank = _bank(decoder, generator)
         pairs["unseen_from_mesh"] = [(fit_mesh(decoder, g, bank, generator), g) for g in unseen[:10]]
-    result: dict[str, object] = {}
+    result: dict[str, dict[str, float]] = {}
     for name, group in pairs.items():
         rows = [measure(decoder, z, g, generator) for z, g in group]
         keys = sorted({k for row in rows for k in row})
@@ -77,6 +77,7 @@ def seam_gap(decoder: IspDecoder, garment: Garment) -> Tensor:
     seam = (garment.border_labels > 0).nonzero()[:, 0]
     panel = torch.zeros(len(garment.panel_points), dtype=torch.long)
     panel[garment.panel_faces[garment.panel_of_face == 1]] = 1
+    assert garment.latent is not None
     lifted = decoder.surface(garment.latent.detach(), garment.panel_points[seam])
     own = lifted[torch.arange(len(seam)), panel[seam]]
     front, back = panel[seam] == 0, panel[seam] == 1

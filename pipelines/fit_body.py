@@ -75,7 +75,7 @@ def to_body(values: dict[str, Tensor]) -> BodyPose:
 
 
 def to_camera(values: dict[str, Tensor], size: tuple[int, int]) -> Camera:
-    """Descent parameters -> a camera at the world's origin that looks along -z, principal point at the photo's centre."""
+    """Descent parameters -> a camera at the world's origin that looks along -z, principal point in the centre."""
     focal, one = values["log_focal"].exp(), torch.ones(())
     zero = torch.zeros(())
     rows = [[focal, zero, one * size[1] / 2], [zero, focal, one * size[0] / 2], [zero, zero, one]]

@@ -80,10 +80,10 @@ def compare_meshes(found: Mesh, truth: Mesh, generator: torch.Generator, count: 
     Returns:
         ``chd``: ISP's Chamfer distance (Eq. 24 per point), mean squared nearest-neighbour distances between ``count``
         random points of each surface, both ways added, with coordinates divided by half the larger side of the truth's
-        bounding box; ISP's tables give it in 1e-4. It has a floor of its own, the spacing of the points; ``chd_surface`` is
-        the same with exact distances to the other surface. ``chamfer_mm``: mean nearest-neighbour distance, both ways averaged.
-        ``surface_mm``, ``surface_p95_mm``: exact distances to the other surface. ``normals``: mean cosine between normals
-        at closest points, both ways averaged (ISP's NC).
+        bounding box; ISP's tables give it in 1e-4. It has a floor of its own, the spacing of the points;
+        ``chd_surface`` is the same with exact distances to the other surface. ``chamfer_mm``: mean nearest-neighbour
+        distance, both ways averaged. ``surface_mm``, ``surface_p95_mm``: exact distances to the other surface.
+        ``normals``: mean cosine between normals at closest points, both ways averaged (ISP's NC).
     """
     p, pn = sample_surface(found, count, generator)
     q, qn = sample_surface(truth, count, generator)

@@ -1,7 +1,7 @@
 """Shared data types: what travels between the rooms.
 
 Conventions: world right-handed, y up, the body faces +z, metres, kilograms, seconds, radians. Cameras follow OpenCV:
-``X_cam = R X + t``, x right, y down, z forward, K in pixels of the original image. Device and dtype come from the tensors.
+``X_cam = R X + t``, x right, y down, z forward, K in pixels of the original image. Device and dtype are the tensors'.
 """
 
 from __future__ import annotations

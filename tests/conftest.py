@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,7 +12,13 @@ from beartype.claw import beartype_packages
 
 # Before anything of the project is imported: from here on every call and return is held against its annotations.
 # Modules with warp kernels are left out: a kernel's annotations are types of warp's language, not Python's.
-KERNELS = ("recon.cloth.contact", "recon.cloth.xpbd", "recon.render.raster")
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = {path: path.read_text() for path in sorted(ROOT.glob("recon/*/*.py"))}
+KERNELS = tuple(
+    f"recon.{path.parent.name}.{path.stem}"
+    for path, text in SOURCES.items()
+    if "@wp.kernel" in text or "@wp.func" in text
+)
 CHECKED = BeartypeConf(is_pep484_tower=True, claw_is_pep526=False, claw_skip_package_names=KERNELS)
 beartype_packages(("recon", "pipelines"), conf=CHECKED)
 

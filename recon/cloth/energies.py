@@ -1,7 +1,8 @@
 """Elastic energies of cloth: St Venant-Kirchhoff membrane, dihedral bending, gravity.
 
-The forms and constants are those of SNUG (Santesteban et al. 2022), which DrapeNet Eq. 16 and GAPS build on. All functions
-take positions ``x`` (..., V, 3) in metres and return energies (...,) in joules, differentiable, finite everywhere.
+The forms and constants are those of SNUG (Santesteban et al. 2022), which DrapeNet Eq. 16 and GAPS build on. All
+functions take positions ``x`` (..., V, 3) in metres and return energies (...,) in joules, differentiable, finite
+everywhere.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Exact self-intersections of a triangle mesh: a broad phase by boxes, then triangle against triangle in float64.
 
-Two triangles intersect if an edge of one passes through the other. Triangles that share one vertex are tested by the edges
-opposite of it, those that share an edge can only overlap by folding flat onto each other, which has no volume and is not
-counted (the exact test of a shared edge is a matter of one plane).
+Two triangles intersect if an edge of one passes through the other. Triangles that share one vertex are tested by the
+edges opposite of it, those that share an edge can only overlap by folding flat onto each other, which has no volume
+and is not counted (the exact test of a shared edge is a matter of one plane).
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from recon.types import Garment, Mesh, UserError
 COARSE = 32
 """Cells of the coarse grid along each axis."""
 LIPSCHITZ = 1.6
-"""Bound on how steep the learned signed distance is; coarse cells further from the border than this allows are skipped."""
+"""Bound on how steep the learned signed distance is; coarse cells that it puts far from the border are skipped."""
 FAR = 1.0
 """Signed distance written where a coarse cell rules the border out [domain units]."""
 MAX_STEP = 0.5
@@ -85,7 +85,8 @@ class IspDecoder:
     def decode_like(self, latent: Tensor, garment: Garment) -> Garment:
         """``garment`` (decoded by this decoder) re-evaluated at a code nearby: same topology, its border re-projected.
 
-        Several times cheaper than ``decode``; decode afresh when the code has moved far (hems by more than a few cells).
+        Several times cheaper than ``decode``; decode afresh when the code has moved far (hems by more than a few
+        cells).
         """
         if self._plan is not None and self._plan[0].panel_faces is garment.panel_faces:
             plan = replace(self._plan[1], points=self.nets.to_domain(garment.panel_points))
@@ -129,7 +130,7 @@ class IspDecoder:
             points = move_safely(panel.points, panel.faces, border, target.cpu().double().numpy())
             panels.append(replace(panel, points=points))
             labels.append(logits.argmax(-1).cpu().numpy())
-        return sew(*panels, *labels, cell)
+        return sew(panels[0], panels[1], labels[0], labels[1], cell)
 
     def _distance_grid(self, field: list[Layer], resolution: int) -> np.ndarray:
         """(R+1, R+1, 2) signed distances; only cells that the coarse grid can't rule out are evaluated."""

@@ -1,8 +1,8 @@
 """The networks of the implicit sewing patterns (ISP §3.1, B.6): one small MLP, conditioned by a latent code.
 
-The code modulates each layer (feature-wise scale and shift, FiLM); for a given code these fold into plain linear weights, so
-that decoding pays for an ordinary MLP. SiLU stands in for the paper's Softplus (several times cheaper on a CPU, as
-smooth), and front and back panel are outputs of one network instead of two.
+The code modulates each layer (feature-wise scale and shift, FiLM); for a given code these fold into plain linear
+weights, so that decoding pays for an ordinary MLP. SiLU stands in for the paper's Softplus (several times cheaper on
+a CPU, as smooth), and front and back panel are outputs of one network instead of two.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ class Layer:
 class FilmNet(nn.Module):
     """MLP ``x (B, N, 2), z (B, Z) -> (B, N, outputs)`` with Fourier input, FiLM conditioning and a skip."""
 
+    frequencies: Tensor
+
     def __init__(self, outputs: int, width: int = 256, depth: int = 4, code: int = 32, octaves: int = 4):
         """``octaves`` Fourier frequencies pi/2, pi, 2 pi ... over the domain [-1, 1]."""
         super().__init__()
@@ -44,10 +46,13 @@ class FilmNet(nn.Module):
         self.film = nn.Sequential(nn.Linear(code, 128), nn.SiLU(), nn.Linear(128, 2 * width * depth))
         self.out = nn.Linear(width, outputs)
         for layer in self.layers:
+            assert isinstance(layer, nn.Linear)
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)
-        nn.init.normal_(self.film[2].weight, 0.0, 0.03)
-        nn.init.zeros_(self.film[2].bias)
+        last = self.film[2]
+        assert isinstance(last, nn.Linear)
+        nn.init.normal_(last.weight, 0.0, 0.03)
+        nn.init.zeros_(last.bias)
 
     def encode(self, x: Tensor) -> Tensor:
         """(..., 2) points of the domain -> (..., 2 + 4 octaves) Fourier features."""

@@ -20,12 +20,13 @@ class LatentPrior:
 
     @staticmethod
     def of(codes: Tensor, shrink: float = 0.1) -> LatentPrior:
-        """Fit to codes (n, z); the covariance is pulled by ``shrink`` towards an isotropic one, so that few codes suffice."""
+        """Fit to codes (n, z); the covariance is pulled by ``shrink`` towards an isotropic one: few codes suffice."""
         mean = codes.mean(0)
         away = (codes - mean).double()
         covariance = away.T @ away / max(len(codes) - 1, 1)
         level = covariance.diagonal().mean().clamp_min(1e-8)
-        covariance = (1 - shrink) * covariance + shrink * level * torch.eye(len(mean), dtype=torch.float64, device=codes.device)
+        isotropic = level * torch.eye(len(mean), dtype=torch.float64, device=codes.device)
+        covariance = (1 - shrink) * covariance + shrink * isotropic
         return LatentPrior(mean, torch.linalg.cholesky(covariance).to(codes.dtype))
 
     def energy(self, z: Tensor) -> Tensor:
@@ -66,10 +67,11 @@ def nearest(codes: Tensor, z: Tensor, count: int = 1) -> Tensor:
 
 
 def editing_direction(codes: Tensor, values: Tensor, ridge: float = 1e-2) -> Tensor:
-    """The direction (z,) in code space along which a measure grows by one unit per unit step, the rest kept if possible.
+    """The direction (z,) in code space along which a measure grows by one unit per unit step, the rest kept.
 
-    values: (n,) the measure of each learned garment (a pattern parameter such as sleeve length [m]). The direction is the
-    change of the mean code with the measure: it stays among the learned codes, unlike the gradient of a regression.
+    values: (n,) the measure of each learned garment (a pattern parameter such as sleeve length [m]). The direction is
+    the change of the mean code with the measure: it stays among the learned codes, unlike the gradient of a
+    regression.
     """
     x, y = codes - codes.mean(0), values - values.mean()
     scale = y.square().mean()

@@ -155,7 +155,8 @@ def split_pinches(faces: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
     """Give every fan of faces around a border vertex its own copy, so that borders are simple loops."""
     edges = border_edges(faces)
     starts, counts = np.unique(edges[:, 0], return_counts=True)
-    faces, extra = faces.copy(), []
+    faces = faces.copy()
+    extra: list[NDArray] = []
     for vertex in starts[counts > 1]:
         around = np.nonzero((faces == vertex).any(1))[0]
         fans = [{int(f)} for f in around]

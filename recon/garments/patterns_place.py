@@ -1,7 +1,7 @@
 """Where a sewn garment starts: a pillow around the body, the front panel before it, the back panel behind it.
 
-Placement decides whether a drape succeeds. Panels share the frontal plane with the T-posed body, so only their depth has
-to be found: just off the body where it is, a thin gap beside it, and closed at the seams.
+Placement decides whether a drape succeeds. Panels share the frontal plane with the T-posed body, so only their depth
+has to be found: just off the body where it is, a thin gap beside it, and closed at the seams.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GAP = 0.022
 
 @dataclass(frozen=True)
 class BodyRelief:
-    """Depth maps of a body seen from the front, with a margin: front surface, back surface and middle over (y, x) cells."""
+    """Depth maps of a body seen from the front, with a margin: front, back and middle over (y, x) cells."""
 
     origin: NDArray
     """(2,) x, y of cell (0, 0) [m]."""
@@ -65,7 +65,7 @@ class BodyRelief:
         return cls(origin, front, back, middle)
 
     def thickness(self, panel: int, bridge: float) -> NDArray:
-        """(H, W) how far the front (0) or back (1) stands out of the middle [m]; hollows up to ``bridge`` wide filled."""
+        """(H, W) how far front (0) or back (1) stands out of the middle [m]; hollows up to ``bridge`` wide filled."""
         out = self.front - self.middle if panel == 0 else self.middle - self.back
         out = np.where(np.isfinite(out), np.maximum(out, 0.0), 0.0)
         if bridge > 0:

@@ -1,4 +1,4 @@
-"""Sew front and back panel along borders of equal label, by arc length (in place of the strips of triangles of ISP B.2).
+"""Sew front and back panel along borders of equal label, by arc length (ISP B.2 puts strips of triangles between).
 
 Each seam's two chains get the same number of points at the same relative arc lengths: points that nearly match move to
 their common place, the others are inserted on the other side. Each pair becomes one vertex of the garment.
@@ -40,7 +40,7 @@ class Sewn:
     points: NDArray[np.float64]
     """(P, 2) domain coordinates."""
     faces: NDArray[np.int64]
-    """(F, 3) panel indices; counter-clockwise in the plane for the front, clockwise for the back (seen from outside)."""
+    """(F, 3) panel indices; counter-clockwise in the plane for the front, clockwise for the back: seen from outside."""
     panel_of_face: NDArray[np.int64]
     """(F,) 0 front, 1 back."""
     vertex_of_point: NDArray[np.int64]
@@ -71,16 +71,16 @@ def clean_runs(labels: NDArray, lengths: NDArray) -> NDArray:
 def corner_near(points: NDArray, lengths: NDArray, change: int) -> int:
     """The loop vertex near a label change (first vertex of the new run) where the border turns most."""
     n = len(points)
-    window = [change]
+    near = [change]
     for step in (-1, 1):
         k, walked = change, 0.0
-        while len(window) < n:
+        while len(near) < n:
             walked += lengths[k if step > 0 else (k - 1) % n]
             if walked > CORNER_REACH:
                 break
             k = (k + step) % n
-            window.append(k)
-    window = np.array(window)
+            near.append(k)
+    window = np.array(near)
     reach = max(1, min(3, int(round(0.02 / max(float(lengths.mean()), 1e-9)))))
     before = points[window] - points[(window - reach) % n]
     after = points[(window + reach) % n] - points[window]
@@ -139,7 +139,7 @@ def _resample(points: NDArray, at: NDArray) -> NDArray:
 
 
 def pair_chains(front: Panel, back: Panel, fronts: list[Chain], backs: list[Chain]) -> list[tuple[Chain, Chain]]:
-    """Chains that belong together: equal label, nearest in the plane; the back chain turned to run along the front one."""
+    """Chains that belong together: equal label, nearest in the plane; back chains turned to run along the front's."""
     at, pairs = np.linspace(0, 1, 9), []
     for label in sorted({c.label for c in fronts} & {c.label for c in backs}):
         a = [c for c in fronts if c.label == label]
@@ -238,7 +238,7 @@ class _Growing:
         coming = row.copy()  # the chain's own point at or after each place
         for k in range(len(row) - 2, -1, -1):
             coming[k] = row[k] if row[k] >= 0 else coming[k + 1]
-        for k in np.nonzero(row < 0)[0]:
+        for k in np.nonzero(row < 0)[0].tolist():
             row[k] = self.insert(int(row[k - 1]), int(coming[k]), place[k], chain.label)
         own = index >= 0
         own[[0, -1]] = False
@@ -269,7 +269,8 @@ def split_chords(points: NDArray, faces: NDArray, labels: NDArray) -> tuple[NDAr
         if not len(inner):
             break
         busy: set[int] = set()
-        middles, halves = [], []
+        middles: list[NDArray] = []
+        halves: list[NDArray] = []
         faces = faces.copy()
         for k in inner:
             pair = owner[which == k].tolist()

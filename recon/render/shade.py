@@ -156,7 +156,7 @@ def _surface(merged: Merged, face: Tensor, uv: Tensor, camera: Camera) -> _Surfa
 
 
 def _light(scene: RayScene, view: View, surface: _Surface, turn: Tensor, camera: Camera, look: Look) -> Tensor:
-    """(N,) light that reaches each point: lamp and sky, with what is in the way; turn (N, 2) shifts the ray patterns."""
+    """(N,) light that reaches each point: lamp and sky, less what is in the way; turn (N, 2) shifts the rays."""
     up = camera.R.detach().to(surface.points) * surface.points.new_tensor([[1.0], [-1.0], [-1.0]])
     axis = torch.nn.functional.normalize(surface.points.new_tensor(look.lamp), dim=0) @ up  # camera's axes -> world
     origins = view.traced(view.points(surface.points + 2e-3 * surface.flat))

@@ -25,7 +25,7 @@ def made_body(body) -> BodyPose:
 
 
 def made_photo(body) -> Photo:
-    """The naked body's photo: its silhouette, its landmarks, and two garment masks cut out of the silhouette by height."""
+    """The naked body's photo: its silhouette, its landmarks, and two garment masks cut out of the silhouette."""
     camera, posed = made_camera(), body.pose(made_body(body))
     image = LabelRenderer([body.faces], [0], [len(body.weights)])([posed.mesh.vertices[0]], camera, SIZE)[0]
     points = body.landmarks(posed)[0]
