@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -50,6 +51,7 @@ def _show_photo(fit_photo: Callable[..., Any], config: Any) -> int:
 COMMANDS = {
     "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
+    "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
     "doctor": Command("say whether everything is in place", "pipelines.doctor", "", "main"),
 }
@@ -126,7 +128,7 @@ def _dispatch(name: str, args: list[str]) -> int:
     if isinstance(came, int):
         return came
     if came is not None:
-        print(came)
+        print(json.dumps(came, indent=1) if isinstance(came, dict) else came)
     return OK
 
 

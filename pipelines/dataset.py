@@ -1,6 +1,6 @@
 """Make the data set of draped garments: ``recon dataset make`` and ``recon dataset pack``.
 
-One process a core; every finished garment is a file of its own, so that a re-run goes on where the last one was stopped.
+One process a core; every finished garment is a file of its own: a re-run goes on where the last one was stopped.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Job:
 def jobs(config: DatasetMake) -> list[Job]:
     """All garments, kinds and splits interleaved: whenever it is stopped, a balanced set exists; tests come early."""
     counts = {"top": config.tops, "skirt": config.skirts, "trousers": config.trousers, "dress": config.dresses}
-    ordered = []
+    ordered: list[tuple[float, int, Job]] = []
     for kind, count in counts.items():
         for split, total in (("train", count), ("test", config.test)):
             for index in range(total):
@@ -101,7 +101,9 @@ def pack_dataset(config: DatasetPack) -> dict:
     """Write ``<kind>_<split>.npz`` from the garments made so far, and the card; returns the card."""
     settings = config.items / "dataset.json"
     if not settings.exists():
-        raise UserError(f"{config.items}: no data set found there; make one with `recon dataset make --out {config.items}`")
+        raise UserError(
+            f"{config.items}: no data set found there; make one with `recon dataset make --out {config.items}`"
+        )
     seed = json.loads(settings.read_text())["seed"]
     counts: dict[str, dict] = {}
     for kind in VARIANTS:
@@ -123,7 +125,7 @@ def _card(folder: Path, seed: int, counts: dict[str, dict]) -> dict:
     log = folder / "log.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     return {
-        "what": "Garments cut from parametric two-panel patterns and draped on the neutral body by this project's simulator",
+        "what": "Garments cut from parametric two-panel patterns, draped on the neutral body by our simulator",
         "licence": "CC0-1.0",
         "seed": seed,
         "garments": kept,
@@ -157,7 +159,9 @@ def _claim(config: DatasetMake) -> None:
     if path.exists():
         found = json.loads(path.read_text())["seed"]
         if found != config.seed:
-            raise UserError(f"{config.out}: holds the set of seed {found}, wanted seed {config.seed} or an empty folder")
+            raise UserError(
+                f"{config.out}: holds the set of seed {found}, wanted seed {config.seed} or an empty folder"
+            )
     config.out.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()}, indent=2))
 

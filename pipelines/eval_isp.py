@@ -20,7 +20,9 @@ RESOLUTION = 256
 """Grid at which decoded garments are compared."""
 
 
-def evaluate(decoder: IspDecoder, seen: list[Garment], unseen: list[Garment], seed: int = 0) -> dict[str, object]:
+def evaluate(
+    decoder: IspDecoder, seen: list[Garment], unseen: list[Garment], seed: int = 0
+) -> dict[str, dict[str, float]]:
     """Figures for the card: learned codes against their own garments, and unseen garments whose code is searched.
 
     ``seen`` are the garments of the first codes. Unseen ones are found twice: from their pattern (distances and labels)

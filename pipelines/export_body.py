@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +77,7 @@ class Source:
     bones: list[str]
     parents: list[int]
     labels: list[str]
-    coefficients: object  # phenotypes (n, P) -> (n, K)
+    coefficients: Callable[[np.ndarray], np.ndarray]  # phenotypes (n, P) -> (n, K)
     keypoints: dict[str, np.ndarray]  # name -> (V,) weights on the kept vertices (rows may not reach 1)
 
 

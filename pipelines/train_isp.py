@@ -1,9 +1,9 @@
 """Train the implicit sewing patterns of one garment kind (ISP §3.1, Eq. 2-5): ``recon train isp --kind top``.
 
-The pattern network, the surface map and a code per garment learn together. Garments know which panel point lies where in
-space, so that Eq. 4's Chamfer distance and normal consistency and Eq. 5's seam consistency are written by correspondence
-(exact, and much sharper than nearest neighbours): distances of points, of their differences along the panel (Sobolev), of
-normals, of borders and seams, and the gap between the two sides of a seam.
+The pattern network, the surface map and a code per garment learn together. Garments know which panel point lies where
+in space, so that Eq. 4's Chamfer distance and normal consistency and Eq. 5's seam consistency are written by
+correspondence (exact, and much sharper than nearest neighbours): distances of points, of their differences along the
+panel (Sobolev), of normals, of borders and seams, and the gap between the two sides of a seam.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def train_isp(config: TrainIsp) -> Path:
     if not garments:
         raise UserError(f"{config.data or config.kind}: no garments of kind {config.kind} to train on")
     decoder, done = learn(garments, config, [item.parameters for item in items])
-    metrics: dict[str, object] = {}
+    metrics: dict[str, dict[str, float]] = {}
     if config.evaluate:
         from pipelines.eval_isp import evaluate
 
@@ -187,9 +187,15 @@ def _descend(
     state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator, checkpoint: Path
 ) -> None:
     """Adam along a cosine that follows the time spent (or the steps, if they are fixed)."""
-    columns = TextColumn("isp {task.fields[kind]}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
-    log = open(config.out / f"isp-{config.kind}.log.jsonl", "a")  # noqa: SIM115
-    budget, smooth, saved = config.minutes * 60, {}, state.seconds
+    columns = (
+        TextColumn("isp {task.fields[kind]}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    log = open(config.out / f"isp-{config.kind}.log.jsonl", "a")
+    budget, saved = config.minutes * 60, state.seconds
+    smooth: dict[str, float] = {}
     with log, Progress(*columns) as progress:
         bar = progress.add_task("train", total=1.0, kind=config.kind, note="")
         while (share := state.step / config.steps if config.steps else state.seconds / budget) < 1:
@@ -204,14 +210,18 @@ def _descend(
             if state.step % 100 == 0:
                 log.write(json.dumps({"step": state.step, "seconds": round(state.seconds, 1), **smooth}) + "\n")
                 log.flush()
-                note = f"step {state.step}  surface {smooth['surface_mm']:.2f} mm  pattern {smooth['pattern_mm']:.2f} mm"
+                note = (
+                    f"step {state.step}  surface {smooth['surface_mm']:.2f} mm  pattern {smooth['pattern_mm']:.2f} mm"
+                )
                 progress.update(bar, completed=share, note=note)
             if state.seconds - saved > 60:
                 saved = state.seconds
                 _save(state, checkpoint, config, len(samples))
 
 
-def take_step(state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator) -> dict[str, float]:
+def take_step(
+    state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator
+) -> dict[str, float]:
     """One step on a random batch; returns the terms in millimetres or natural units."""
     garments = torch.randperm(len(samples), generator=generator)[: config.batch]
     z = state.codes[garments]
@@ -272,7 +282,7 @@ def surface_loss(
     terms["seam"] = torch.stack([_length(side - seam_3d).mean() for side in sides]).mean()
     terms["gap"] = _length(sides[0] - sides[1]).mean()
     weights = {"point": 1.0, "border": 0.5, "seam": 0.5, "gap": 0.5, "difference": 0.02, "normal": 0.01}
-    loss = sum(weights[k] * v for k, v in terms.items())
+    loss = sum((weights[k] * v for k, v in terms.items()), start=terms["gap"].new_zeros(()))
     names = {"point": "surface_mm", "border": "border_mm", "gap": "gap_mm", "normal": "normal"}
     return loss, {names[k]: v.detach() for k, v in terms.items() if k in names}
 
@@ -330,10 +340,12 @@ def _resume(state: Progressing, path: Path, config: TrainIsp, count: int) -> Non
 def _settings(config: TrainIsp, count: int) -> str:
     """What a checkpoint must agree with to go on from it."""
     free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
-    return json.dumps({**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True)
+    return json.dumps(
+        {**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True
+    )
 
 
-def store(decoder: IspDecoder, config: TrainIsp, done: Progressing, metrics: dict[str, object]) -> Path:
+def store(decoder: IspDecoder, config: TrainIsp, done: Progressing, metrics: dict[str, dict[str, float]]) -> Path:
     """Write ``isp-<kind>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
     tensors = {"codes": decoder.codes, **decoder.nets.state_dict()}
     card = {

@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 import trimesh
-from tests.garments.synthetic import tube
 
 from recon.metrics import boundary_loops, compare_meshes, panel_iou, sample_surface, surface_distance
 from recon.types import Mesh
+from tests.garments.synthetic import tube
 
 
 def sphere(radius: float) -> Mesh:

@@ -1,7 +1,8 @@
 """Quasi-static rest of a garment on a body: minimise elastic energy, gravity and contact by L-BFGS.
 
-Energy and gradient are those of :mod:`recon.cloth.energies` (tests compare them), written out in one compiled double-precision
-kernel on one thread: a hundred times cheaper than automatic differentiation, and the digits suffice for a line search.
+Energy and gradient are those of :mod:`recon.cloth.energies` (tests compare them), written out in one compiled
+double-precision kernel on one thread: a hundred times cheaper than automatic differentiation, and the digits suffice
+for a line search.
 """
 
 from __future__ import annotations
@@ -211,7 +212,8 @@ def polish(
         near = np.flatnonzero((distance < s.reach) & (distance > 1e-7))
         planes = [(near, on[near], away[near] / distance[near, None]), *_holds(x, limits, level, s)]
         pairs = close_strangers(x, limits.rest, s.apart)
-        energy.touch(*(np.concatenate(column) for column in zip(*planes)), pairs, s)
+        vertex, point, normal = (np.concatenate(column) for column in zip(*planes))
+        energy.touch(vertex, point, normal, pairs, s)
         x = lbfgs(energy, x, s.iterations)
     return x
 
@@ -228,8 +230,10 @@ def _holds(x: NDArray, limits: Constraints, level: float, s: PolishSettings):
         yield legs, normal * (s.middle - s.offset), normal
 
 
-def lbfgs(function: Callable[[NDArray], tuple[float, NDArray]], x: NDArray, iterations: int, memory: int = 10) -> NDArray:
-    """Minimise by L-BFGS with backtracking (Nocedal & Wright, algorithms 7.4 and 3.1); never ends higher than it began."""
+def lbfgs(
+    function: Callable[[NDArray], tuple[float, NDArray]], x: NDArray, iterations: int, memory: int = 10
+) -> NDArray:
+    """Minimise by L-BFGS with backtracking (Nocedal & Wright, algorithms 7.4, 3.1); never ends higher than it began."""
     value, gradient = function(x)
     steps: list[tuple[NDArray, NDArray, float]] = []
     for _ in range(iterations):

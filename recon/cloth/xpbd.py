@@ -1,8 +1,8 @@
 """A small XPBD cloth simulator (Macklin et al. 2016) that settles a sewn garment on a body, on the CPU through Warp.
 
-All substeps between two contact searches run inside ONE compiled kernel on one thread: constraints are swept one after the
-other (Gauss-Seidel), which is deterministic and, for a few thousand vertices, many times faster than one launch per
-constraint colour. Parallelism comes from one process a garment.
+All substeps between two contact searches run inside ONE compiled kernel on one thread: constraints are swept one
+after the other (Gauss-Seidel), which is deterministic and, for a few thousand vertices, many times faster than one
+launch per constraint colour. Parallelism comes from one process a garment.
 """
 
 from __future__ import annotations

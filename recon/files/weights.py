@@ -87,7 +87,9 @@ def write_weights(
     Replaces weights of the same name, leaves the others as they are; several processes may write to one folder.
     """
     folder = Path(folder)
-    stored = {k: v.detach().cpu().to(dtype if v.is_floating_point() else v.dtype).contiguous() for k, v in tensors.items()}
+    stored = {
+        k: v.detach().cpu().to(dtype if v.is_floating_point() else v.dtype).contiguous() for k, v in tensors.items()
+    }
     bad = [k for k, v in stored.items() if v.is_floating_point() and not v.isfinite().all()]
     if bad:
         raise ValueError(f"{name}: {bad[0]} is not finite in {dtype}")

@@ -1,7 +1,7 @@
 """The data set of draped garments: drawing one, and the compact files that they ship in.
 
-A file holds all garments of one kind and split in npz format (no pickles): positions in whole quanta of 0.05 mm, coded as
-differences, and the panels that they were cut from. A card (json) beside it says where it comes from.
+A file holds all garments of one kind and split in npz format (no pickles): positions in whole quanta of 0.05 mm,
+coded as differences, and the panels that they were cut from. A card (json) beside it says where it comes from.
 """
 
 from __future__ import annotations
@@ -79,7 +79,9 @@ def draw(room, kind: str, split: str, index: int, seed: int) -> Item:
 def write_items(path: Path, kind: str, items: Sequence[Item]) -> None:
     """Write garments of one kind into one file, whole or not at all."""
     garments = [item.garment for item in items]
-    columns: dict[str, list[NDArray]] = {name: [] for name in ("vertices", "points", "faces", "welds", "labels", "fronts")}
+    columns: dict[str, list[NDArray]] = {
+        name: [] for name in ("vertices", "points", "faces", "welds", "labels", "fronts")
+    }
     for g in garments:
         faces = g.panel_faces.numpy()
         columns["vertices"].append(_quanta(g.mesh.vertices.numpy()))
@@ -122,7 +124,9 @@ def read_items(path: Path) -> list[Item]:
     except FileNotFoundError:
         raise UserError(f"{path}: not found; make it with `recon dataset make`") from None
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: no garment file ({type(error).__name__}), wanted one of `recon dataset make`") from None
+        raise UserError(
+            f"{path}: no garment file ({type(error).__name__}), wanted one of `recon dataset make`"
+        ) from None
     items = []
     for i, variant in enumerate(meta["variants"]):
         welds = torch.tensor(columns["welds"][i][:, 0].astype(np.int64) & 0xFFFF)
@@ -140,7 +144,9 @@ def read_items(path: Path) -> list[Item]:
             variant=variant,
         )
         items.append(
-            Item(garment, meta["parameters"][i], meta["attempts"][i], tuple(meta["rejected"][i]), meta["stretch_p95"][i])
+            Item(
+                garment, meta["parameters"][i], meta["attempts"][i], tuple(meta["rejected"][i]), meta["stretch_p95"][i]
+            )
         )
     return items
 
@@ -171,7 +177,9 @@ def _quanta(positions: NDArray) -> NDArray:
 
 def _encode(parts: list[NDArray]) -> NDArray:
     """Differences along each part, all low bytes before all high bytes, column by column: what compresses well."""
-    whole = np.concatenate([np.diff(p.view(np.uint16), axis=0, prepend=np.zeros((1, p.shape[1]), np.uint16)) for p in parts])
+    whole = np.concatenate(
+        [np.diff(p.view(np.uint16), axis=0, prepend=np.zeros((1, p.shape[1]), np.uint16)) for p in parts]
+    )
     return np.ascontiguousarray(whole.T).view(np.uint8).reshape(-1, 2).T.copy()
 
 

@@ -5,8 +5,8 @@
 >>> garment = weld(pattern, measures)       # a "pillow" around the body, ready to be simulated
 
 Border labels: ``border_labels[i]`` names the border edge that STARTS at point i when the panel's border is walked
-counter-clockwise in the panel's plane (:func:`border_loops` does the walk). So every border edge has exactly one label, and
-the end of a seam is the next edge's first point.
+counter-clockwise in the panel's plane (:func:`border_loops` does the walk). So every border edge has exactly one
+label, and the end of a seam is the next edge's first point.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def cut(variant: str, parameters: dict[str, float], edge_length: float | None = 
         total = sum(area(_loop(piece)) for pieces in outline.values() for piece in pieces)
         edge_length = max(EDGE_LENGTH, float(np.sqrt(total / (0.866 * MAX_VERTICES))))
     names = SEAM_NAMES[kind]
-    points, faces, panel_f, panel_p, labels, held, runs = [], [], [], [], [], [], [{}, {}]
+    parts, faces, panel_f, panel_p, labels, held = [], [], [], [], [], []
+    runs: list[dict[str, NDArray]] = [{}, {}]
     offset = 0
     for panel, side in enumerate(("front", "back")):
         for piece in outline[side]:
@@ -119,13 +120,13 @@ def cut(variant: str, parameters: dict[str, float], edge_length: float | None = 
                     runs[panel][edge.label] = run + offset
                 if edge.held:
                     held.append(run + offset)
-            points.append(mesh.points)
+            parts.append(mesh.points)
             faces.append((mesh.faces if panel == 0 else mesh.faces[:, [0, 2, 1]]) + offset)
             panel_f.append(np.full(len(mesh.faces), panel))
             panel_p.append(np.full(len(mesh.points), panel))
             labels.append(label)
             offset += len(mesh.points)
-    points = np.round(np.concatenate(points) / QUANTUM) * QUANTUM
+    points = np.round(np.concatenate(parts) / QUANTUM) * QUANTUM
     seams = np.unique(np.concatenate([np.stack([runs[0][k], runs[1][k]], 1) for k in runs[0]]), axis=0)
     if np.abs(points[seams[:, 0]] - points[seams[:, 1]]).max() > 1e-9:
         raise ValueError("front and back seams differ")
@@ -172,7 +173,7 @@ def welded(count: int, seams: NDArray) -> NDArray:
 
 
 def border_loops(garment: Garment) -> list[tuple[int, NDArray, NDArray]]:
-    """The panels' borders as ``(panel, points, labels)``: closed loops of point indices, counter-clockwise in the plane.
+    """The panels' borders as ``(panel, points, labels)``: closed loops of points, counter-clockwise in the plane.
 
     ``labels[i]`` belongs to the edge from ``points[i]`` to ``points[i + 1]`` (cyclic).
     """

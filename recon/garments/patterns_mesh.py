@@ -122,8 +122,8 @@ def _relax(points: NDArray, faces: NDArray, fixed: int, loop: NDArray, h: float)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.concatenate([edges, edges[:, ::-1]])
     count = np.bincount(edges[:, 0], minlength=len(points))
-    mean = np.stack([np.bincount(edges[:, 0], points[edges[:, 1], k], len(points)) for k in (0, 1)], 1)
-    mean /= np.maximum(count, 1)[:, None]
+    total = np.stack([np.bincount(edges[:, 0], points[edges[:, 1], k], len(points)) for k in (0, 1)], 1)
+    mean = total / np.maximum(count, 1)[:, None]
     near = cKDTree(loop).query(points)[0] < 2.2 * h
     near[:fixed] = False
     return np.where(near[:, None], 0.5 * points + 0.5 * mean, points)

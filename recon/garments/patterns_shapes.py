@@ -1,10 +1,12 @@
 """The cuts themselves: outlines of tops, skirts, trousers and dresses from named sizes.
 
-An outline is the border of the front or back panel in the frontal plane of the T-posed body: x to the wearer's left, y up,
-metres. Left and right are mirror images, so only the left half is drawn.
+An outline is the border of the front or back panel in the frontal plane of the T-posed body: x to the wearer's left,
+y up, metres. Left and right are mirror images, so only the left half is drawn.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ Outline = dict[str, list[list[Edge]]]
 """Panel name ("front", "back") -> its pieces (two where the front is cut open) -> their border, counter-clockwise."""
 
 
-def bezier(*points: NDArray, count: int = 33) -> NDArray:
+def bezier(*points: NDArray | Sequence[float], count: int = 33) -> NDArray:
     """(count, 2) points on the Bézier curve of these control points."""
     t = np.linspace(0, 1, count)[:, None]
     level = [np.broadcast_to(np.asarray(p, float), (count, 2)) for p in points]
@@ -173,7 +175,8 @@ def trousers(p: dict[str, float]) -> Outline:
     side = through(points, 1)
     radius = p["crotch_radius"]
     # The inseam starts as a quarter of an arch under the crotch, so that two legs never leave from one point.
-    arch = bezier(crotch, [0.75 * radius, crotch[1]], [radius, crotch[1] - 0.35 * radius], [radius, crotch[1] - 1.4 * radius])
+    ends = [radius, crotch[1] - 0.35 * radius], [radius, crotch[1] - 1.4 * radius]
+    arch = bezier(crotch, [0.75 * radius, crotch[1]], *ends)
     inseam_points = [arch[-1]]
     if p["knee_y"] > p["hem_y"] + 0.08:
         inseam_points.append(np.array([p["knee_inner_x"], p["knee_y"]]))

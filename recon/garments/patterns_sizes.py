@@ -1,7 +1,7 @@
 """Sizes of clothes that people wear, drawn at random for a body: tight to oversized, cropped to long.
 
-Each function returns the named sizes [m] (and a few unitless shape factors) that ``patterns_shapes`` cuts from. "Ease" is
-what a garment is wider than the body; with two panels a girth g needs a half width of g / 4.
+Each function returns the named sizes [m] (and a few unitless shape factors) that ``patterns_shapes`` cuts from. "Ease"
+is what a garment is wider than the body; with two panels a girth g needs a half width of g / 4.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def trousers(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     p["hip_x"] = _trunk(m, m.hip_y) + 0.012 + 0.05 * fit
     ease = 0.017 + 0.04 * fit
     p["thigh_y"] = p["crotch_y"] - 0.04
-    p["thigh_outer_x"] = p["crotch_radius"] + (m.leg.girth_at(m.crotch_y - 0.06) + SKIN) / 2 + ease
+    p["thigh_outer_x"] = float(p["crotch_radius"] + (m.leg.girth_at(m.crotch_y - 0.06) + SKIN) / 2 + ease)
     if variant == "shorts":
         p["hem_y"] = rng.uniform(m.knee_y - 0.03, p["crotch_y"] - 0.10)
     else:
@@ -135,8 +135,11 @@ def _trunk(m: Measures, y: float) -> float:
 
 
 def _legs(p: Parameters, m: Measures, knee_ease: float, hem_ease: float, drift: float) -> None:
-    """Widths at knee and hem. The side seam goes on straight down from the thigh (drifting outwards by ``drift``), so that
-    the panel's legs part in the plane, as those of the wearer do."""
+    """Widths at knee and hem.
+
+    The side seam goes on straight down from the thigh (drifting outwards by ``drift``): the panel's legs part in the
+    plane, as those of the wearer do.
+    """
     p["knee_y"] = m.knee_y
     knee, hem = _leg(m, m.knee_y) + knee_ease, _leg(m, p["hem_y"]) + hem_ease
     for y in np.arange(p["hem_y"], m.knee_y, 0.02):  # the calf is wider than a straight line from knee to ankle
@@ -171,7 +174,8 @@ def _yoke(p: Parameters, m: Measures) -> None:
     p["yoke_y"] = 0.5 * (p["waist_y"] + p["hip_y"])
     p["yoke_x"] = max(0.45 * p["waist_x"] + 0.55 * p["hip_x"], _trunk(m, p["yoke_y"]) + 0.013)
     if "waist_drop" in p:
-        # Hips make a cone of the cloth below a waistband. Laid flat, a level waistband is an arc at right angles to the sides.
+        # Hips make a cone of the cloth below a waistband. Laid flat, a level waistband is an arc at right angles to
+        # the sides.
         p["waist_drop"] = 0.5 * p["waist_x"] * (p["yoke_x"] - p["waist_x"]) / (p["waist_y"] - p["yoke_y"])
 
 

@@ -1,6 +1,7 @@
 """Shared by the garment tests: a decoder trained for a moment on made garments."""
 
 import pytest
+
 from tests.garments.synthetic import family
 
 

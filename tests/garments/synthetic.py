@@ -11,7 +11,9 @@ from recon.types import Garment, Mesh
 SEAMS = ("open", "side_l", "side_r")
 
 
-def tube(bottom: float = 0.30, top: float = 0.24, height: float = 0.5, opening: float = 0.0, cells: int = 24) -> Garment:
+def tube(
+    bottom: float = 0.30, top: float = 0.24, height: float = 0.5, opening: float = 0.0, cells: int = 24
+) -> Garment:
     """A tube of half widths ``bottom`` and ``top`` [m]; an ``opening`` [m] cuts the front open, as a jacket's."""
     points, spots, faces, sides, labels = [], [], [], [], []
 
