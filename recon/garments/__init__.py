@@ -54,6 +54,10 @@ class GarmentDecoder(Protocol):
         """One code (z,) -> a sewn garment at rest, vertices differentiable in the code."""
         ...
 
+    def decode_like(self, latent: Tensor, garment: Garment) -> Garment:
+        """The same for a code near the one of ``garment``, in the topology of that: cheaper while a code descends."""
+        ...
+
 
 def load_decoder(
     kind: str, name: str = "isp", device: str | torch.device = "cpu", folder: str | Path | None = None
