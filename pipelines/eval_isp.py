@@ -13,11 +13,13 @@ from pipelines.isp_samples import along, panel_border, signed_distance
 from recon.garments.isp import IspDecoder
 from recon.garments.latents import LatentPrior, spread
 from recon.garments.sewing import is_manifold
-from recon.metrics import boundary_loops, compare_meshes, panel_iou, sample_surface
+from recon.metrics import boundary_loops, compare_meshes, largest_stretch, panel_iou, sample_surface
 from recon.types import Garment, UserError
 
 RESOLUTION = 256
 """Grid at which decoded garments are compared."""
+FROM_MESH = 4
+"""How many unseen garments are also found from their mesh: each takes a hundred decodings."""
 
 
 def evaluate(
@@ -33,7 +35,7 @@ def evaluate(
     if unseen:
         pairs["unseen_from_pattern"] = [(fit_pattern(decoder, g, seed=seed), g) for g in unseen]
         bank = _bank(decoder, generator)
-        pairs["unseen_from_mesh"] = [(fit_mesh(decoder, g, bank, generator), g) for g in unseen[:10]]
+        pairs["unseen_from_mesh"] = [(fit_mesh(decoder, g, bank, generator), g) for g in unseen[:FROM_MESH]]
     result: dict[str, dict[str, float]] = {}
     for name, group in pairs.items():
         rows = [measure(decoder, z, g, generator) for z, g in group]
@@ -50,10 +52,11 @@ def measure(decoder: IspDecoder, latent: Tensor, truth: Garment, generator: torc
             found = decoder.decode(latent, RESOLUTION)
         except UserError:
             return {"decodes": 0.0}
-        row = compare_meshes(found.mesh, truth.mesh, generator)
+        row = compare_meshes(found.mesh, truth.mesh, generator, 5000)
         row["decodes"] = 1.0
         row["panel_iou"] = panel_iou(found, truth)
         row["right_loops"] = float(boundary_loops(found.mesh.faces) == boundary_loops(truth.mesh.faces))
+        row["stretch_p95"] = float(largest_stretch(found).quantile(0.95))
         row["manifold"] = float(is_manifold(found.mesh.faces.numpy()))
         row["labels"] = label_accuracy(decoder, latent, truth)
         gap = seam_gap(decoder, found)

@@ -75,7 +75,7 @@ class TrainIsp:
     """Layers of A_Φ."""
     code: int = 32
     """Length of a latent code."""
-    evaluate: int = 20
+    evaluate: int = 10
     """Held-out garments to evaluate on; 0 = none."""
 
 
@@ -281,7 +281,7 @@ def surface_loss(
     sides = [joint[:, k, :, k] for k in (0, 1)]
     terms["seam"] = torch.stack([_length(side - seam_3d).mean() for side in sides]).mean()
     terms["gap"] = _length(sides[0] - sides[1]).mean()
-    weights = {"point": 1.0, "border": 0.5, "seam": 0.5, "gap": 0.5, "difference": 0.02, "normal": 0.01}
+    weights = {"point": 1.0, "border": 0.5, "seam": 0.5, "gap": 0.5, "difference": 0.03, "normal": 0.01}
     loss = sum((weights[k] * v for k, v in terms.items()), start=terms["gap"].new_zeros(()))
     names = {"point": "surface_mm", "border": "border_mm", "gap": "gap_mm", "normal": "normal"}
     return loss, {names[k]: v.detach() for k, v in terms.items() if k in names}

@@ -112,6 +112,19 @@ def face_normals(mesh: Mesh) -> Tensor:
     return normal / normal.norm(dim=1, keepdim=True).clamp_min(1e-12)
 
 
+def largest_stretch(garment: Garment) -> Tensor:
+    """(F,) how many times longer the cloth is in space than on its panel, in each triangle's worst direction."""
+    flat = garment.panel_points.detach()[garment.panel_faces]
+    space = garment.mesh.vertices.detach()[garment.mesh.faces]
+    edges = torch.stack([flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]], -1)
+    spans = torch.stack([space[:, 1] - space[:, 0], space[:, 2] - space[:, 0]], -1)
+    sound = edges.det().abs() > 1e-9
+    deformation = spans[sound] @ torch.linalg.inv(edges[sound])
+    gram = deformation.mT @ deformation
+    half, off = (gram[:, 0, 0] + gram[:, 1, 1]) / 2, (gram[:, 0, 0] - gram[:, 1, 1]) / 2
+    return (half + (off.square() + gram[:, 0, 1].square()).sqrt()).sqrt()
+
+
 def boundary_loops(faces: Tensor) -> int:
     """How many open borders a mesh has: 4 for a T-shirt (neck, hem, two cuffs), 3 for an open jacket."""
     edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
@@ -148,4 +161,3 @@ def _raster(garment: Garment, panel: int, low: NDArray, cell: float, shape: list
     for triangle in fixed:
         cv2.fillConvexPoly(image, triangle, 1, shift=8)
     return image > 0
-

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from recon.metrics import boundary_loops, compare_meshes, panel_iou, sample_surface, surface_distance
+from recon.metrics import boundary_loops, compare_meshes, largest_stretch, panel_iou, sample_surface, surface_distance
 from recon.types import Mesh
 from tests.garments.synthetic import tube
 
@@ -62,6 +62,11 @@ def test_borders_are_counted():
     assert boundary_loops(sphere(1.0).faces) == 0
     assert boundary_loops(tube().mesh.faces) == 2
     assert boundary_loops(tube(opening=0.05).mesh.faces) == 1
+
+
+def test_a_tube_is_stretched_no_further_than_its_cut():
+    stretch = largest_stretch(tube(0.25, 0.25, 0.5))
+    assert stretch.median() == pytest.approx(1.0, abs=0.1) and stretch.max() < 1.2
 
 
 def test_panel_overlap():

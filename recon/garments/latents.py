@@ -40,6 +40,11 @@ class LatentPrior:
         return self.mean + white.to(self.mean.device) @ self.factor.T
 
 
+def mahalanobis(latent: Tensor, codes: Tensor) -> Tensor:
+    """Mean squared Mahalanobis distance per dimension of latents (..., z) from the learned codes (n, z): (...)."""
+    return LatentPrior.of(codes).energy(latent)
+
+
 def spread(codes: Tensor, count: int, among: Tensor | None = None) -> Tensor:
     """Indices of up to ``count`` codes that cover the learned ones (farthest points first from the most central one).
 
