@@ -7,7 +7,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.init()
 
 REACH = 2.0

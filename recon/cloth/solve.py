@@ -18,7 +18,7 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import GRAVITY, Cloth
 from recon.cloth.xpbd import Constraints, close_strangers, held_height
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
 
 DEVICE = "cpu"

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 DEVICE = "cpu"
