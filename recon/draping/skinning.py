@@ -21,9 +21,9 @@ class SkinningDraper:
         Args:
             body: a ``recon.bodies`` body.
             method: key of ``binding.METHODS``.
-            lattice: read GAPS' participation, which rbf settles, from a lattice that is sampled on first use (a second or
-                two): several times faster, 0.3 mm from the exact binding in the mean, and differentiable in the garment's
-                rest vertices also through the weights. Other methods are always evaluated exactly, weights held.
+            lattice: read GAPS' participation, which rbf settles, from a lattice that is sampled on first use (about two
+                seconds): several times faster, 0.3 mm from the exact binding in the mean, and differentiable in the
+                garment's rest vertices also through the weights. Other methods are evaluated exactly, weights held.
         """
         if method not in METHODS:
             raise ValueError(f"skinning: found method {method!r}; wanted one of {', '.join(METHODS)}")
