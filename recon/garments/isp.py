@@ -15,8 +15,8 @@ from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import sew
 from recon.types import Garment, Mesh, UserError
 
-COARSE = 32
-"""Cells of the coarse grid along each axis."""
+COARSE = (32, 128)
+"""Cells of the coarser grids along each axis."""
 LIPSCHITZ = 1.6
 """Bound on how steep the learned signed distance is; coarse cells that it puts far from the border are skipped."""
 FAR = 1.0
@@ -126,31 +126,34 @@ class IspDecoder:
                 raise UserError(f"{self.kind}: the code describes no garment; start from a learned code")
             border = panel.border
             start = torch.as_tensor(panel.points[border], dtype=self.codes.dtype, device=self.codes.device)
-            target, logits = self._project(field, start, torch.full((len(border),), k), MAX_STEP * cell, 2)
+            target, logits = self._project(field, start, torch.full((len(border),), k), MAX_STEP * cell, 1)
             points = move_safely(panel.points, panel.faces, border, target.cpu().double().numpy())
             panels.append(replace(panel, points=points))
             labels.append(logits.argmax(-1).cpu().numpy())
         return sew(panels[0], panels[1], labels[0], labels[1], cell)
 
     def _distance_grid(self, field: list[Layer], resolution: int) -> np.ndarray:
-        """(R+1, R+1, 2) signed distances; only cells that the coarse grid can't rule out are evaluated."""
+        """(R+1, R+1, 2) signed distances; only what coarser grids can't rule out is evaluated, elsewhere the sign counts."""
         axis = torch.as_tensor(grid_axis(resolution), dtype=self.codes.dtype, device=self.codes.device)
-        if resolution <= 2 * COARSE:
+        levels = [cells for cells in COARSE if 2 * cells <= resolution]
+        known = needed = None
+        for cells in levels:
+            middle = (torch.arange(cells, dtype=axis.dtype, device=axis.device) + 0.5) * (2 / cells) - 1
+            known = self._refine(field, middle, known, needed)
+            margin = LIPSCHITZ * 2**0.5 / cells + 2.0 / resolution
+            needed = (known.abs() < margin).any(-1)
+        return self._refine(field, axis, known, needed).double().cpu().numpy()
+
+    def _refine(self, field: list[Layer], axis: Tensor, known: Tensor | None, needed: Tensor | None) -> Tensor:
+        """Signed distances (n, n, 2) at all pairs of ``axis``, evaluated in the coarser grid's ``needed`` cells only."""
+        if known is None or needed is None:
             grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
-            out = self.nets.pattern.run_folded(field, grid.view(-1, 2))[:, :2]
-            return out.view(*grid.shape).double().cpu().numpy()
-        size = 2.0 / COARSE
-        middle = torch.arange(COARSE, dtype=axis.dtype, device=axis.device) * size - 1 + size / 2
-        centres = torch.stack(torch.meshgrid(middle, middle, indexing="ij"), -1).view(-1, 2)
-        coarse = self.nets.pattern.run_folded(field, centres)[:, :2].view(COARSE, COARSE, 2)
-        margin = LIPSCHITZ * size / 2**0.5 + 2.0 / resolution
-        needed = (coarse.abs() < margin).any(-1)
-        cell = ((axis + 1) / size).long().clamp(0, COARSE - 1)
-        near = needed[cell[:, None], cell[None]]
-        distance = torch.where(coarse > 0, FAR, -FAR)[cell[:, None], cell[None]].to(axis.dtype)
-        i, j = near.nonzero(as_tuple=True)
+            return self.nets.pattern.run_folded(field, grid.view(-1, 2))[:, :2].view(*grid.shape)
+        cell = ((axis + 1) * (len(known) / 2)).long().clamp(0, len(known) - 1)
+        distance = torch.where(known > 0, FAR, -FAR).to(axis.dtype)[cell[:, None], cell[None]]
+        i, j = needed[cell[:, None], cell[None]].nonzero(as_tuple=True)
         distance[i, j] = self.nets.pattern.run_folded(field, torch.stack([axis[i], axis[j]], 1))[:, :2]
-        return distance.double().cpu().numpy()
+        return distance
 
     def _slope(self, field: list[Layer], x: Tensor, panel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Signed distance (N,), its gradient (N, 2) in x, and label logits (N, L) of each point's own panel."""
