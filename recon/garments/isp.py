@@ -133,7 +133,7 @@ class IspDecoder:
         return sew(panels[0], panels[1], labels[0], labels[1], cell)
 
     def _distance_grid(self, field: list[Layer], resolution: int) -> np.ndarray:
-        """(R+1, R+1, 2) signed distances; only what coarser grids can't rule out is evaluated, elsewhere the sign counts."""
+        """(R+1, R+1, 2) signed distances; what coarser grids rule out is not evaluated: ±FAR."""
         axis = torch.as_tensor(grid_axis(resolution), dtype=self.codes.dtype, device=self.codes.device)
         levels = [cells for cells in COARSE if 2 * cells <= resolution]
         known = needed = None
@@ -145,7 +145,7 @@ class IspDecoder:
         return self._refine(field, axis, known, needed).double().cpu().numpy()
 
     def _refine(self, field: list[Layer], axis: Tensor, known: Tensor | None, needed: Tensor | None) -> Tensor:
-        """Signed distances (n, n, 2) at all pairs of ``axis``, evaluated in the coarser grid's ``needed`` cells only."""
+        """Signed distances (n, n, 2) at all pairs of ``axis``, evaluated in ``needed`` coarse cells only."""
         if known is None or needed is None:
             grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
             return self.nets.pattern.run_folded(field, grid.view(-1, 2))[:, :2].view(*grid.shape)
