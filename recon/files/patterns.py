@@ -78,17 +78,28 @@ def pattern_svg(garment: Garment, name: str) -> str:
         raise ValueError(f"{name}: panel coordinates are NaN or infinite; nothing was written")
     pieces, (width, height) = _lay_out([cut_pieces(garment, panel) for panel in (0, 1)])
     size = float(np.clip(0.011 * width, 8.0, 26.0))
-    numbers: dict[tuple[int, frozenset[int]], int] = {}
-    for run in (run for piece in pieces for run in piece.runs if run.label > 0):
-        numbers.setdefault((run.label, run.vertices), len(numbers) + 1)
+    numbers = _seam_numbers(pieces)
     height += 3.5 * size
     body = [_draw(piece, garment.seam_names, numbers, size) for piece in pieces]
-    body.append(_foot(f"{name} · {garment.variant or garment.kind}", height, size))
+    body.append(_foot(" · ".join(dict.fromkeys([name, garment.variant or garment.kind])), height, size))
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" class="pattern" width="{width:.2f}mm" height="{height:.2f}mm" '
         f'viewBox="0 0 {width:.2f} {height:.2f}">\n<title>{escape(name)}</title>\n<style>{_STYLE}</style>\n'
         f'<rect width="100%" height="100%" fill="#ffffff"/>\n' + "\n".join(body) + "\n</svg>\n"
     )
+
+
+def _seam_numbers(pieces: list[Piece]) -> dict[tuple[int, frozenset[int]], int]:
+    """(label, vertices) of each sewn run -> the number of its seam: runs that share most vertices share it."""
+    numbers: dict[tuple[int, frozenset[int]], int] = {}
+    for run in (run for piece in pieces for run in piece.runs if run.label > 0):
+        shared = {key: len(key[1] & run.vertices) for key in numbers if key[0] == run.label}
+        partner = max(shared, key=lambda key: shared[key], default=None)
+        if partner is None or 2 * shared[partner] <= min(len(partner[1]), len(run.vertices)):
+            numbers[run.label, run.vertices] = max(numbers.values(), default=0) + 1
+        else:
+            numbers[run.label, run.vertices] = numbers[partner]
+    return numbers
 
 
 def _foot(title: str, height: float, size: float) -> str:
@@ -235,7 +246,7 @@ def _draw(
         middle, outward = _middle(run, piece)
         text = f"{run.length:.0f} mm"
         if run.label > 0:
-            text = f"{numbers[run.label, run.vertices]} {seam_names[run.label]} · {text}"
+            text = f"{numbers[run.label, run.vertices]} {seam_names[run.label].replace('_', ' ')} · {text}"
             parts.append(_tick(middle, outward, size, line))
         parts.append(_label(text, middle, outward, size, kind))
     low, high = piece.box
@@ -284,21 +295,36 @@ def _label(text: str, at: NDArray[np.float64], outward: NDArray[np.float64], siz
     )
 
 
+def _clear_row(piece: Piece, low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Where there is room for text: x and y of its start, and how far the piece reaches to the right of it [mm]."""
+    best = (float(low[0]), float(0.5 * (low + high)[1]), 0.0)
+    for share in (0.5, 0.4, 0.6, 0.3, 0.7):
+        y = float(low[1] + share * (high - low)[1])
+        xs = np.linspace(low[0], high[0], 61)
+        inside = np.array([_contains(piece, np.array([x, y])) for x in xs] + [False])
+        starts = np.flatnonzero(inside & ~np.concatenate([[False], inside[:-1]]))
+        for start in starts.tolist():
+            width = float(xs[1] - xs[0]) * int(np.argmin(inside[start:]) - 1)
+            if 0.6 * width > 1.2 * best[2]:
+                best = (float(xs[start]) + 0.4 * width, y, 0.6 * width)
+    return best
+
+
 def _grain(piece: Piece, low: NDArray[np.float64], high: NDArray[np.float64], size: float, line: float) -> str:
     """The grain line (upright on the wearer), the piece's name beside it."""
-    inside = [
-        x for x in np.linspace(low[0], high[0], 25)[1:-1] if _contains(piece, np.array([x, 0.5 * (low + high)[1]]))
-    ]
-    x = min(inside, key=lambda at: abs(at - 0.5 * (low + high)[0])) if inside else 0.5 * (low + high)[0]
-    y0, y1 = low[1] + 0.35 * (high - low)[1], low[1] + 0.65 * (high - low)[1]
+    x, middle, room = _clear_row(piece, low, high)
+    half = 0.12 * float((high - low)[1])
+    while half > 2 * size and not all(_contains(piece, np.array([x, middle + end])) for end in (-half, half)):
+        half *= 0.9
+    y0, y1 = middle - half, middle + half
     a = 0.35 * size
     arrow = (
         f"M{x:.2f} {y0:.2f}V{y1:.2f}M{x - a:.2f} {y0 + 2 * a:.2f}L{x:.2f} {y0:.2f}L{x + a:.2f} {y0 + 2 * a:.2f}"
         f"M{x - a:.2f} {y1 - 2 * a:.2f}L{x:.2f} {y1:.2f}L{x + a:.2f} {y1 - 2 * a:.2f}"
     )
-    beside, middle = x + size, 0.5 * (y0 + y1)
+    beside = x + size
     name = escape(piece.name)
-    fitting = min(1.4 * size, (high[0] - x) / (0.62 * len(piece.name)))
+    fitting = min(1.4 * size, room / (0.62 * len(piece.name)))
     return (
         f'<path class="grain" stroke-width="{line:.2f}" d="{arrow}"/>'
         f'<text class="name" x="{beside:.2f}" y="{middle:.2f}" font-size="{fitting:.1f}">{name}</text>'
