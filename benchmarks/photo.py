@@ -1,11 +1,11 @@
 """The photo pipeline measured: the bundled photos, photos beside the repository, and outfits of known truth.
 
-    python benchmarks/photo.py                 # everything; JSON to docs/results/photo.json, tables to docs/results/photo.md
-    python benchmarks/photo.py --only demo     # one job; names are those of JOBS, or 'truth'
+    python benchmarks/photo.py                 # everything; JSON to docs/results/photo.json, tables to
+    docs/results/photo.md python benchmarks/photo.py --only demo     # one job; names are those of JOBS, or 'truth'
 
-Each photo runs as a user would run it (``recon photo`` in a process of its own), so that its peak memory and time are its
-own. Outfits of known truth are test garments that no decoder has seen, skinned to unseen bodies and poses, rendered to
-masks; landmarks are the body's own points with 1 % noise. Perception is not part of those.
+Each photo runs as a user would run it (``recon photo`` in a process of its own), so that its peak memory and time are
+its own. Outfits of known truth are test garments that no decoder has seen, skinned to unseen bodies and poses,
+rendered to masks; landmarks are the body's own points with 1 % noise. Perception is not part of those.
 """
 
 from __future__ import annotations
@@ -86,7 +86,10 @@ def keep_picture(name: str, out: Path) -> None:
 
 def table(rows: dict[str, dict]) -> list[str]:
     """Markdown rows, one per garment."""
-    head = "| photo | garment | IoU | IoU, code only | inside body (v/f) | self-intersections | stretch p95 | total s | peak GB |"
+    head = (
+        "| photo | garment | IoU | IoU, code only | inside body (v/f) | self-intersections | stretch p95 | total s "
+        "| peak GB |"
+    )
     lines = [head, "|" + "---|" * 9]
     for name, row in rows.items():
         if "error" in row:

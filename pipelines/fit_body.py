@@ -47,10 +47,13 @@ class BodyFit:
     """Weight of the landmarks' robust distance."""
     landmark_scale: float = 0.03
     """Distance at which a landmark stops pulling harder, in units of the person's height in the photo."""
-    bones: float = 1.0
+    bones: float = 0.4
     """Weight of limb directions in space against the landmark network's guess."""
-    prior: float = 0.02
+    prior: float = 0.15
     """Weight of the pose prior (limits and Mahalanobis distance)."""
+    upright: float = 0.1
+    """Weight of the body's lean out of the vertical (unit: 0.1 rad) and of the camera's pitch (unit: 0.3 rad): people
+    stand upright before a tilted camera rather than lean before a level one."""
     shape: float = 0.02
     """Weight of the squared shape coefficients."""
     inside: float = 6.0
@@ -65,8 +68,8 @@ class BodyFit:
     """Resolution of the silhouettes."""
 
 
-PARAMETERS = {"shape": 0.03, "pose": 0.02, "translation": 0.01, "log_focal": 0.01}
-"""Body and camera parameters with their step sizes (unit normal, rad, m, log)."""
+PARAMETERS = {"shape": 0.03, "pose": 0.02, "translation": 0.01, "log_focal": 0.01, "pitch": 0.01}
+"""Body and camera parameters with their step sizes (unit normal, rad, m, log, rad)."""
 
 
 def to_body(values: dict[str, Tensor]) -> BodyPose:
@@ -75,12 +78,22 @@ def to_body(values: dict[str, Tensor]) -> BodyPose:
 
 
 def to_camera(values: dict[str, Tensor], size: tuple[int, int]) -> Camera:
-    """Descent parameters -> a camera at the world's origin that looks along -z, principal point in the centre."""
-    focal, one = values["log_focal"].exp(), torch.ones(())
-    zero = torch.zeros(())
-    rows = [[focal, zero, one * size[1] / 2], [zero, focal, one * size[0] / 2], [zero, zero, one]]
-    K = torch.stack([torch.stack([v.reshape(()) for v in row]) for row in rows])
-    return Camera(K, torch.diag(torch.tensor([1.0, -1.0, -1.0])), torch.zeros(3), size)
+    """Descent parameters -> a camera at the world's origin that looks along -z, pitched down by ``pitch`` [rad].
+
+    The principal point is the photo's centre.
+    """
+    focal, pitch = values["log_focal"].exp(), values["pitch"]
+    zero, one = torch.zeros_like(focal), torch.ones_like(focal)
+    K = torch.stack([focal, zero, one * size[1] / 2, zero, focal, one * size[0] / 2, zero, zero, one]).reshape(3, 3)
+    c, s = pitch.cos(), pitch.sin()
+    R = torch.stack([one, zero, zero, zero, -c, s, zero, -s, -c]).reshape(3, 3)
+    return Camera(K, R, focal.new_zeros(3), size)
+
+
+def lean(posed: PosedBody) -> Tensor:
+    """() squared sine of the angle between the body's axis (between the ankles to the neck) and the vertical."""
+    axis = posed.joints[0, 12] - (posed.joints[0, 7] + posed.joints[0, 8]) / 2
+    return 1 - torch.nn.functional.normalize(axis, dim=0)[1].square()
 
 
 def person_height(photo: Photo) -> float:
@@ -97,7 +110,8 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     height = person_height(photo)
     close = robust_distance(camera.project(points), photo.landmarks[:, :2], trust, settings.landmark_scale * height)
     a, b = (torch.tensor(side) for side in zip(*BONES))
-    ours, theirs = points[b] - points[a], photo.landmarks_world[b] - photo.landmarks_world[a]
+    seen = (points @ camera.R.T) * points.new_tensor([1.0, -1.0, -1.0])  # y up before the camera, as the guess is
+    ours, theirs = seen[b] - seen[a], photo.landmarks_world[b] - photo.landmarks_world[a]
     sure = torch.minimum(trust[a], trust[b])
     aligned = 1 - torch.cosine_similarity(ours, theirs, dim=-1)
     bones = (sure * aligned).sum() / sure.sum().clamp_min(1e-6)
@@ -108,6 +122,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
         + settings.bones * bones
         + settings.prior * pose_prior(values["pose"]).mean()
         + settings.shape * values["shape"].square().mean()
+        + settings.upright * (lean(posed) / 0.1**2 + values["pitch"].square() / 0.3**2)
         + 0.05 * lens
     )
 
@@ -127,6 +142,7 @@ def start_values(body, photo: Photo, settings: BodyFit) -> dict[str, Tensor]:
         "pose": pose,
         "translation": torch.zeros(1, 3),
         "log_focal": torch.tensor(focal).log(),
+        "pitch": torch.zeros(()),
     }
     with torch.no_grad():
         points = body.landmarks(body.pose(to_body(values)))[0]
@@ -166,7 +182,7 @@ def fit_body(photo: Photo, body, renderer_of: Callable, settings: BodyFit, tick=
         settings: see :class:`BodyFit`.
 
     Returns:
-        shape (1, S), pose (1, 24, 3) [rad], translation (1, 3) [m], log_focal () [log px], the camera at the origin.
+        shape (1, S), pose (1, 24, 3) [rad], translation (1, 3) [m], log_focal () [log px], pitch () [rad].
     """
 
     def by_landmarks(values: dict[str, Tensor]) -> Tensor:

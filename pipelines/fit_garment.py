@@ -83,9 +83,9 @@ class Models:
     """(faces, labels, n_vertices) -> label renderer."""
 
 
-BODY_SIZES = {"shape": 0.01, "pose": 0.006, "translation": 0.003, "log_focal": 0.002}
+BODY_SIZES = {"shape": 0.01, "pose": 0.006, "translation": 0.003, "log_focal": 0.002, "pitch": 0.002}
 """Step sizes of body and camera while a code descends: they only settle."""
-ANCHOR_UNITS = {"shape": 0.5, "pose": 0.1, "translation": 0.02, "log_focal": 0.1}
+ANCHOR_UNITS = {"shape": 0.5, "pose": 0.1, "translation": 0.02, "log_focal": 0.1, "pitch": 0.05}
 
 
 def photo_size(photo: Photo) -> tuple[int, int]:
@@ -107,8 +107,8 @@ def retrieve(
 ) -> Tensor:
     """Codes by the overlap of their draped silhouettes with the mask, best first.
 
-    A first round looks at codes that cover all allowed ones, a second at the neighbours of its best: with few codes that
-    is all of them. Pixels under an outer garment's mask count neither for nor against, like hair and hands.
+    A first round looks at codes that cover all allowed ones, a second at the neighbours of its best: with few codes
+    that is all of them. Pixels under an outer garment's mask count neither for nor against, like hair and hands.
 
     Returns:
         (n,) indices into the decoder's codes, best first.

@@ -18,7 +18,7 @@ from recon.types import Mesh, Photo
 def overlaps(
     meshes: dict[str, Mesh], values: dict[str, Tensor], photo: Photo, models: Models, at: Level
 ) -> dict[str, float]:
-    """Name -> intersection over union of the rendered layer with its mask, occlusion included, ignored pixels left out."""
+    """Name -> intersection over union of the layer as seen with its mask, ignored pixels left out."""
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
         camera = at.camera(to_camera(values, photo_size(photo)))
@@ -45,7 +45,7 @@ def geometry(layer: Layer, mesh: Mesh, contact: BodyContact) -> dict[str, float 
 
     Returns:
         vertices, faces: counts; penetrating_vertices, penetrating_faces: inside the body (faces by their centres);
-        self_intersections: pairs of faces; stretch_p95: 95th percentile of the larger principal stretch (1 = unstretched).
+        self_intersections: pairs of faces; stretch_p95: 95th percentile of the larger principal stretch (1 = rest).
     """
     with torch.no_grad():
         inside = contact.signed_distance(mesh.vertices) < 0

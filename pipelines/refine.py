@@ -95,7 +95,7 @@ def physics_loss(piece: Piece, x: Tensor, settings: Refinement) -> Tensor:
 
 
 def clearance_loss(contact: BodyContact, x: Tensor, faces: Tensor, margin: float) -> Tensor:
-    """Missing clearance of vertices and face centres, summed over area-like counts so that few deep points still count."""
+    """Missing clearance of vertices and face centres, mean square in units of the margin, times ten."""
     points = torch.cat([x, x[faces].mean(1)])
     lack = F.relu(margin - contact.signed_distance(points)) / margin
     return lack.square().mean() * 10

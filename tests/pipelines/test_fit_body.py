@@ -41,3 +41,12 @@ def test_loss_is_finite_without_a_visible_landmark():
     loss = evidence_loss(values, body.pose(to_body(values)), body, photo, QUICK)
     loss.backward()
     assert torch.isfinite(loss) and torch.isfinite(values["pose"].grad).all()
+
+
+def test_a_pitched_camera_looks_down():
+    values = {"log_focal": torch.tensor(5.0), "pitch": torch.tensor(0.2)}
+    camera = to_camera(values, SIZE)
+    below = camera.project(torch.tensor([[0.0, -2.0 * torch.tan(torch.tensor(0.2)).item(), -2.0]]))
+    torch.testing.assert_close(below, torch.tensor([[SIZE[1] / 2, SIZE[0] / 2]]))
+    torch.testing.assert_close(camera.R @ camera.R.T, torch.eye(3))
+    assert torch.linalg.det(camera.R) > 0
