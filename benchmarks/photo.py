@@ -94,14 +94,15 @@ def table(rows: dict[str, dict]) -> list[str]:
     for name, row in rows.items():
         if "error" in row:
             lines.append(
-                f"| {name} | {row['wanted']} | {row['error']} | | | | | {row['wall_seconds']} | {row['peak_memory_gb']} |"
+                f"| {name} | {row['wanted']} | {row['error']} | | | | "
+                f"| {row['wall_seconds']} | {row['peak_memory_gb']} |"
             )
             continue
         for garment, g in row["garments"].items():
             inside = f"{g['penetrating_vertices']}/{g['penetrating_faces']}"
             lines.append(
-                f"| {name} | {garment} | {g['iou']:.3f} | {g['iou_code_only']:.3f} | {inside} | {g['self_intersections']} "
-                f"| {g['stretch_p95']:.3f} | {row['seconds']['total']:.0f} | {row['peak_memory_gb']} |"
+                f"| {name} | {garment} | {g['iou']:.3f} | {g['iou_code_only']:.3f} | {inside} "
+                f"| {g['self_intersections']} | {g['stretch_p95']:.3f} | {row['seconds']['total']:.0f} | {row['peak_memory_gb']} |"
             )
     return lines
 

@@ -54,7 +54,7 @@ class BodyFit:
     upright: float = 0.1
     """Weight of the body's lean out of the vertical (unit: 0.1 rad) and of the camera's pitch (unit: 0.3 rad): people
     stand upright before a tilted camera rather than lean before a level one."""
-    shape: float = 0.02
+    shape: float = 0.06
     """Weight of the squared shape coefficients."""
     inside: float = 6.0
     """Weight of body coverage outside the person's mask."""

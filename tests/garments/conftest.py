@@ -17,8 +17,14 @@ def training(tmp_path_factory, tubes):
     from pipelines.train_isp import TrainIsp, learn
 
     config = TrainIsp(
-        kind="skirt", out=tmp_path_factory.mktemp("weights"), steps=260, threads=1, batch=6, width=96, code=8,
-        evaluate=0
+        kind="skirt",
+        out=tmp_path_factory.mktemp("weights"),
+        steps=260,
+        threads=1,
+        batch=6,
+        width=96,
+        code=8,
+        evaluate=0,
     )
     return *learn(tubes, config), config
 
