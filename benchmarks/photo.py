@@ -21,6 +21,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("GARMENT_RECON_SHARED", ROOT.parent / "shared"))
 
@@ -78,10 +80,13 @@ def run_photo(name: str, job: Job, out: Path) -> dict:
 
 
 def keep_picture(name: str, out: Path) -> None:
-    """Copy the overview picture of one result to docs/results."""
-    source = out / name / "overview.jpg"
-    if source.exists():
-        shutil.copyfile(source, ROOT / "docs" / "results" / f"photo-{name}.jpg")
+    """One picture of a result, overlay and turntable side by side, in docs/results."""
+    parts = [cv2.imread(str(out / name / f)) for f in ("overlay.png", "turntable.png")]
+    if any(part is None for part in parts):
+        return
+    same = [cv2.resize(p, (round(p.shape[1] * 420 / p.shape[0]), 420), interpolation=cv2.INTER_AREA) for p in parts]
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 85]
+    cv2.imwrite(str(ROOT / "docs" / "results" / f"photo-{name}.jpg"), cv2.hconcat(same), quality)
 
 
 def table(rows: dict[str, dict]) -> list[str]:
@@ -102,7 +107,8 @@ def table(rows: dict[str, dict]) -> list[str]:
             inside = f"{g['penetrating_vertices']}/{g['penetrating_faces']}"
             lines.append(
                 f"| {name} | {garment} | {g['iou']:.3f} | {g['iou_code_only']:.3f} | {inside} "
-                f"| {g['self_intersections']} | {g['stretch_p95']:.3f} | {row['seconds']['total']:.0f} | {row['peak_memory_gb']} |"
+                f"| {g['self_intersections']} | {g['stretch_p95']:.3f} "
+                f"| {row['seconds']['total']:.0f} | {row['peak_memory_gb']} |"
             )
     return lines
 
