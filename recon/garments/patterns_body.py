@@ -28,15 +28,15 @@ class Profile:
     high: NDArray
     """(N, 2) greatest coordinates of the slice's two in-plane axes [m]."""
 
-    def girth_at(self, position: float | NDArray) -> NDArray:
+    def girth_at(self, position: float | NDArray) -> NDArray | float:
         """Girth [m] at positions along the axis."""
         return np.interp(position, self.at, self.girth)
 
-    def low_at(self, position: float | NDArray, axis: int) -> NDArray:
+    def low_at(self, position: float | NDArray, axis: int) -> NDArray | float:
         """Least in-plane coordinate [m] at positions along the axis."""
         return np.interp(position, self.at, self.low[:, axis])
 
-    def high_at(self, position: float | NDArray, axis: int) -> NDArray:
+    def high_at(self, position: float | NDArray, axis: int) -> NDArray | float:
         """Greatest in-plane coordinate [m] at positions along the axis."""
         return np.interp(position, self.at, self.high[:, axis])
 

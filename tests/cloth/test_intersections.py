@@ -74,6 +74,7 @@ def test_agrees_with_ipctk(roughness: float) -> None:
 
 def test_agrees_with_a_test_of_every_pair() -> None:
     v, f = grid(1, 0.7)
+    f = f[:70]
     all_pairs = set()
     for i in range(len(f)):
         for j in range(i + 1, len(f)):
