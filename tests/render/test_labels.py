@@ -83,7 +83,7 @@ def test_vertex_gradients_match_finite_differences() -> None:
     scene = Dressed()
     vertices = [m.vertices + torch.tensor([0.0, 0, z]) for m, z in zip(scene.meshes, (0.0, 0.0, 1.3))]
     outward = [v - v.mean(0) for v in vertices]
-    field = [o * torch.stack([1.5 + (3 * v[:, 1]).sin()] * 3, 1) for o, v in zip(outward, vertices)]
+    field = [o * torch.stack([1.5 + (9 * v[:, 1]).sin()] * 3, 1) for o, v in zip(outward, vertices)]
     view = rolled()
 
     def loss(at: list[Tensor], samples: int = 4) -> Tensor:
