@@ -85,7 +85,7 @@ def test_the_gate_says_what_is_wrong(room: FittingRoom, items: list[Item]) -> No
     inside[:, 2] *= 0.2
     inside[:, 0] *= 0.2
     assert room.judge(replace(g, mesh=g.mesh.with_vertices(inside))).reason == "in the body"
-    wide = (vertices - vertices.mean(0)) * torch.tensor([1.6, 1.0, 1.6]) + vertices.mean(0)
+    wide = (vertices - vertices.mean(0)) * torch.tensor([2.2, 1.0, 2.2]) + vertices.mean(0)
     assert room.judge(replace(g, mesh=g.mesh.with_vertices(wide))).reason == "stretched"
     assert room.judge(replace(g, mesh=g.mesh.with_vertices(vertices * float("nan")))).reason
     assert Verdict(0, 0, 1.01, 3).reason == "self-intersection"
