@@ -160,7 +160,7 @@ def scene_images(
 
 def anchor_loss(values: dict[str, Tensor], anchors: dict[str, Tensor]) -> Tensor:
     """Squared distance of body and camera from where the body stage left them, in ANCHOR_UNITS."""
-    return sum(((values[k] - anchors[k]) / u).square().mean() for k, u in ANCHOR_UNITS.items())
+    return torch.stack([((values[k] - anchors[k]) / u).square().mean() for k, u in ANCHOR_UNITS.items()]).sum()
 
 
 class GarmentLoss:
@@ -182,13 +182,10 @@ class GarmentLoss:
 
     def _decode(self, latent: Tensor) -> Garment:
         """The code's garment: topology is kept for a few steps, since cutting and sewing cost most of a decode."""
-        moved = self._shape is None or (latent.detach() - self._cut_at).norm() > self._reach
-        if moved or self._age >= self.settings.refresh:
-            self._shape, self._cut_at, self._age = (
-                self.decoder.decode(latent, self.settings.resolution),
-                latent.detach(),
-                0,
-            )
+        moved = bool((latent.detach() - self._cut_at).norm() > self._reach)
+        if self._shape is None or moved or self._age >= self.settings.refresh:
+            self._shape = self.decoder.decode(latent, self.settings.resolution)
+            self._cut_at, self._age = latent.detach(), 0
             return self._shape
         self._age += 1
         return self.decoder.decode_like(latent, self._shape)
@@ -248,6 +245,7 @@ def fit_garment(
         tries = [{**values, "latent": decoder.codes[i]} for i in starts] if best is None else [best.values]
         ends = [descend(t, sizes, loss, plan, tick) for t in tries]
         best = min(ends, key=lambda e: e.loss)
+    assert best is not None, "a fit needs at least one level"
     found = {k: best.values[k] for k in ANCHOR_UNITS}
     with torch.no_grad():
         garment = decoder.decode(best.values["latent"], settings.final_resolution)
