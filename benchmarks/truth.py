@@ -17,7 +17,7 @@ from pipelines.photo import PhotoFit, fit_evidence, load_models
 from pipelines.run import Run
 from recon.bodies.pose_prior import sample_poses
 from recon.garments.dataset import load_garments
-from recon.metrics import surface_distance
+from recon.metrics import compare_meshes
 from recon.types import BodyPose, Camera, Mesh, Photo
 
 SIZE = (800, 600)
@@ -102,7 +102,7 @@ def run_truth(cases: int, out: Path) -> dict:
             shift = truth.pelvis - models.body.pose(to_body(values)).joints[0, 0]
         for name, mesh in meshes.items():
             moved = mesh.with_vertices(mesh.vertices + shift)
-            distance = surface_distance(moved, truth.meshes[name]) * 1000
+            distance = compare_meshes(moved, truth.meshes[name], torch.Generator().manual_seed(0))["surface_mm"]
             rows.append({"case": number, "garment": name, "iou": iou[name], "chamfer_mm": float(distance)})
             print(rows[-1], flush=True)
     kinds = {}
