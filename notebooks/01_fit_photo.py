@@ -62,8 +62,10 @@ if QUICK:
         ),
         refinement=replace(
             refinement,
-            settle=replace(refinement.settle, steps=5),
-            match=replace(refinement.match, steps=4),
+            dressing=replace(refinement.dressing, frames=8),
+            settle=5,
+            rounds=1,
+            steps=4,
             long_side=96,
         ),
     )

@@ -137,7 +137,7 @@ def fit_evidence(
     """The fit itself: body and camera, then garments from outer to inner, then all of them under physics.
 
     Returns:
-        Body and camera parameters; the layers at rest, outermost first; name -> refined posed mesh.
+        Body and camera parameters; the layers at rest, graded, outermost first; name -> refined posed mesh.
     """
     values = run.stage(
         "body", lambda s: fit_body(photo, models.body, models.renderer_of, s, tick), config=config.body_fit
@@ -150,5 +150,5 @@ def fit_evidence(
             config=config.garment_fit,
         )
         layers.append(layer)
-    meshes = run.stage("refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement)
-    return values, layers, meshes
+    refined = run.stage("refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement)
+    return values, refined.layers, refined.meshes

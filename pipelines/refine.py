@@ -1,113 +1,68 @@
-"""Stage 'refine': the fitted layers' vertices move freely under cloth physics and the photo's silhouettes.
+"""Stage 'refine': the fitted layers become cloth, at rest on the body and under the photo's silhouettes.
 
-DrapeNet Eq. 15 (strain, bending, gravity, collision) with the label overlap kept as evidence; layers push each other in
-their order; ends with no vertex and no face centre inside the body.
+The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
+simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
+overlap, all layers at once. Ends with no vertex and no face centre inside the body.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
-from pipelines.evidence import level
+from pipelines.evidence import Level, level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size, scene_images
 from recon.cloth.contact import BodyContact
-from recon.cloth.energies import GRAVITY, Cloth, bending, gravity, stvk
-from recon.cloth.smooth import SmoothCoordinates
-from recon.descend import Descent, descend
+from recon.cloth.energies import Cloth, Fabric
+from recon.cloth.layers import LayeredCloth
+from recon.cloth.solve import PolishSettings, lbfgs
+from recon.draping.dress import Dressing, dress, limits_of, neutral
+from recon.garments.grading import grade
 from recon.losses import soft_iou_loss
-from recon.types import Mesh, Photo
+from recon.types import Camera, Mesh, Photo, PosedBody, to_device
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """Settings of the refine stage; weights are unitless."""
+    """Settings of the refine stage."""
 
-    settle: Descent = field(default_factory=lambda: Descent(steps=80, patience=80, final=0.3))
-    """First descent: physics alone, which takes out what skinning stretched."""
-    match: Descent = field(default_factory=lambda: Descent(steps=90, patience=30, final=0.15))
-    """Second descent: physics and silhouettes."""
+    dressing: Dressing = field(default_factory=Dressing)
+    """How the garments are put on and carried into the pose."""
+    settle: int = 40
+    """Minimisation steps of physics alone."""
+    rounds: int = 8
+    """Rounds of minimisation with the silhouettes; contacts are searched anew in each."""
+    steps: int = 10
+    """Minimisation steps per round."""
     long_side: int = 288
     """Resolution of the silhouettes."""
-    evidence: float = 1.0
-    """Weight of the labels' overlap loss."""
-    strain: float = 0.1
-    """Weight of StVK energy per area, in units of the energy density at 5 % stretch."""
-    bend: float = 2.0
-    """Weight of bending energy per area, in the same unit."""
-    weight: float = 0.05
-    """Weight of the height of the centre of mass (gravity), in metres of drop."""
-    contact: float = 1.0
-    """Weight of missing clearance to the body and to the layer beneath."""
-    clearance: float = 0.004
-    """Wanted clearance between cloth and body, and between layers [m]."""
-    hold: float = 1.0
-    """Weight that holds waist borders where they were draped, in units of 1 cm."""
-    step: float = 0.002
-    """Step size of the free vertices [m]."""
-    stiffness: float = 15.0
-    """Width of one step's neighbourhood (see SmoothCoordinates)."""
+    evidence: float = 10.0
+    """Energy of a whole garment's overlap lost [J]: what the cloth would pay for it in strain."""
+    stretch: float = 10.0
+    """Factor on the fabric's membrane stiffness: ready-to-wear cloth hardly stretches."""
+    bend: float = 10.0
+    """Factor on its bending stiffness: folds as wide as the mesh can show."""
+    reach: float = 0.06
+    """Body and layers are in each other's way within this distance [m]."""
+    margin: float = 5e-4
+    """Distance from the body that every vertex and face centre ends with [m]."""
 
 
 @dataclass(frozen=True)
-class Piece:
-    """One layer made ready for physics."""
+class Refined:
+    """Where the stage ends."""
 
-    layer: Layer
-    cloth: Cloth
-    smooth: SmoothCoordinates
-    held: Tensor
-    """(n,) indices of vertices on a waist border."""
-    start: Tensor
-    """(V, 3) draped vertices before refinement [m]."""
-
-
-def waist(layer: Layer) -> Tensor:
-    """Vertices of borders that are named a waist: what keeps trousers and skirts from falling."""
-    garment = layer.garment
-    names = [i for i, n in enumerate(garment.seam_names) if "waist" in n]
-    on = torch.isin(garment.border_labels, torch.tensor(names, dtype=garment.border_labels.dtype))
-    return torch.unique(garment.vertex_of_point[on])
-
-
-def make_piece(layer: Layer, draped: Tensor, settings: Refinement) -> Piece:
-    """Physics of one layer with its panels as the rest shape."""
-    faces = layer.garment.mesh.faces
-    smooth = SmoothCoordinates(faces, len(draped), settings.stiffness)
-    return Piece(layer, Cloth.from_garment(layer.garment), smooth, waist(layer), draped)
-
-
-def physics_loss(piece: Piece, x: Tensor, settings: Refinement) -> Tensor:
-    """Strain, bending, gravity and the held waist of one layer, each per garment and unitless."""
-    fabric = piece.cloth.fabric
-    unit = piece.cloth.areas.sum() * fabric.thickness * (fabric.lame_mu + 0.5 * fabric.lame_lambda) * 0.05**2
-    loss = settings.strain * stvk(piece.cloth, x) / unit + settings.bend * bending(piece.cloth, x) / unit
-    fall = gravity(piece.cloth, x - piece.start) / (GRAVITY * piece.cloth.masses.sum())
-    loss = loss + settings.weight * fall
-    if len(piece.held):
-        drift = (x[piece.held] - piece.start[piece.held]) / 0.01
-        loss = loss + settings.hold * drift.square().sum(1).mean()
-    return loss
-
-
-def clearance_loss(contact: BodyContact, x: Tensor, faces: Tensor, margin: float) -> Tensor:
-    """Missing clearance of vertices and face centres, mean square in units of the margin, times ten."""
-    points = torch.cat([x, x[faces].mean(1)])
-    lack = F.relu(margin - contact.signed_distance(points)) / margin
-    return lack.square().mean() * 10
-
-
-def layer_loss(outer: Tensor, inner: Tensor, inner_faces: Tensor, margin: float) -> Tensor:
-    """Outer vertices must stay on the outside of the inner layer, where it lies within 4 cm of them."""
-    contact = BodyContact(inner, inner_faces)
-    gap = contact.signed_distance(outer)
-    near = gap > -0.04
-    lack = F.relu(margin - gap) / margin
-    return torch.where(near, lack, torch.zeros_like(lack)).square().mean() * 10
+    layers: list[Layer]
+    """The garments with their panels graded to the person, outermost first."""
+    meshes: dict[str, Mesh]
+    """Name -> posed mesh (V, 3), faces as in the layer's garment."""
 
 
 def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, rounds: int = 60) -> Tensor:
@@ -132,55 +87,86 @@ def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, roun
     return x
 
 
+class Evidence:
+    """The silhouettes' overlap of stacked layers as an energy: value [J] and gradient [N]."""
+
+    def __init__(self, posed: PosedBody, faces: list[Tensor], at: Level, camera: Camera, models: Models, weight: float):
+        """``faces`` of each layer in the order of ``at``'s names; ``weight`` [J] per garment's overlap."""
+        self.posed, self.faces, self.at, self.camera, self.models = posed, faces, at, camera, models
+        self.weight = weight
+
+    def __call__(self, parts: list[NDArray]) -> tuple[float, NDArray]:
+        """Vertices (V, 3) of each layer -> energy and its gradient, stacked."""
+        xs = [torch.from_numpy(p).to(self.at.targets).requires_grad_() for p in parts]
+        with torch.enable_grad():
+            image = scene_images(self.posed, list(zip(xs, self.faces)), self.camera, self.at.size, self.models)
+            loss = self.weight * soft_iou_loss(image, self.at.targets, self.at.weight).sum()
+            gradients = torch.autograd.grad(loss, xs)
+        return loss.item(), np.concatenate([g.cpu().double().numpy() for g in gradients])
+
+
+def graded(layers: list[Layer], values: dict[str, Tensor], models: Models) -> list[Layer]:
+    """The layers with panels that fit the person's shape, on the CPU."""
+    unposed = models.body.pose(neutral(to_body(values)))
+    worn = [models.draper.drape(layer.garment, unposed).vertices[0] for layer in layers]
+    cut = [replace(layer, garment=grade(layer.garment, x)) for layer, x in zip(layers, worn)]
+    return [to_device(layer, torch.device("cpu")) for layer in cut]
+
+
 def refine(
-    values: dict[str, Tensor], layers: list[Layer], photo: Photo, models: Models, settings: Refinement, tick=None
-) -> dict[str, Mesh]:
+    values: dict[str, Tensor],
+    layers: list[Layer],
+    photo: Photo,
+    models: Models,
+    settings: Refinement,
+    tick: Callable[[int, float], None] | None = None,
+) -> Refined:
     """Refine all layers together.
 
     Args:
         values: body and camera of the last garment's stage.
         layers: outermost first, all with names in ``photo.garments``.
+        photo: the evidence.
+        models: body, draper, renderer.
+        settings: see :class:`Refinement`.
+        tick: hears (step, energy).
 
     Returns:
-        Name -> posed mesh (V, 3), faces as in the layer's garment; no vertex or face centre inside the body.
+        The layers with graded panels, and their posed meshes: no vertex or face centre is inside the body.
     """
+    tick = tick or (lambda step, energy: None)
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
-        draped = [models.draper.drape(layer.garment, posed).vertices[0] for layer in layers]
-    contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
-    pieces = [make_piece(layer, x, settings) for layer, x in zip(layers, draped)]
+        layers = graded(layers, values, models)
+    garments = [layer.garment for layer in layers]
+    start = dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick)
+    device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
+    body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
+    fabric = Fabric().scaled(stretch=settings.stretch, bending=settings.bend)
+    cloths = [Cloth.from_garment(replace(g, panel_points=g.panel_points.double()), fabric) for g in garments]
+    physics = LayeredCloth(
+        cloths, [limits_of(g) for g in garments], body, PolishSettings(reach=settings.reach, apart=0.5)
+    )
     at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
-    camera = at.camera(to_camera(values, photo_size(photo)))
+    camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
+    evidence = Evidence(posed, faces, at, camera, models, settings.evidence)
 
-    def positions(free: dict[str, Tensor]) -> list[Tensor]:
-        return [p.smooth.decode(free[p.layer.name]) for p in pieces]
+    def total(x: NDArray) -> tuple[float, NDArray]:
+        value, gradient = physics(x)
+        more, pull = evidence(physics.split(x))
+        return value + more, gradient + pull
 
-    def physics(free: dict[str, Tensor]) -> Tensor:
-        xs = positions(free)
-        loss = xs[0].new_zeros(())
-        for k, (piece, x) in enumerate(zip(pieces, xs)):
-            faces = piece.layer.garment.mesh.faces
-            loss = loss + physics_loss(piece, x, settings)
-            loss = loss + settings.contact * clearance_loss(contact, x, faces, settings.clearance)
-            for inner, y in zip(pieces[k + 1 :], xs[k + 1 :]):
-                inner_faces = inner.layer.garment.mesh.faces
-                loss = loss + settings.contact * layer_loss(x, y.detach(), inner_faces, settings.clearance)
-        return loss
-
-    def with_evidence(free: dict[str, Tensor]) -> Tensor:
-        xs = positions(free)
-        scene = [(x, p.layer.garment.mesh.faces) for x, p in zip(xs, pieces)]
-        image = scene_images(posed, scene, camera, at.size, models)
-        return physics(free) + settings.evidence * soft_iou_loss(image, at.targets, at.weight).sum()
-
-    free = {p.layer.name: p.smooth.encode(p.start) for p in pieces}
-    sizes = dict.fromkeys(free, settings.step)
-    free = descend(free, sizes, physics, settings.settle, tick).values
-    free = descend(free, sizes, with_evidence, settings.match, tick).values
-    ends = {}
-    with torch.no_grad():
-        xs = positions(free)
-    for piece, x in zip(pieces, xs):
-        faces = piece.layer.garment.mesh.faces
-        ends[piece.layer.name] = Mesh(push_out(x, faces, contact, 5e-4), faces)
-    return ends
+    x = np.concatenate(start)
+    physics.hold(x)
+    physics.touch(x)
+    x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
+    for number in range(settings.rounds):
+        physics.touch(x)
+        x = lbfgs(total, x, settings.steps, precondition=physics.preconditioner())
+        tick(number, physics(x)[0])
+    contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
+    meshes = {}
+    for layer, part, f in zip(layers, physics.split(x), faces):
+        free = torch.from_numpy(part).to(device, torch.float32)
+        meshes[layer.name] = Mesh(push_out(free, f, contact, settings.margin), f)
+    return Refined([to_device(layer, device) for layer in layers], meshes)

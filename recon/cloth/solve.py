@@ -7,8 +7,8 @@ for a line search.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import warp as wp
@@ -44,6 +44,38 @@ class PolishSettings:
     """Distance that legs keep from the body's middle plane [m]."""
 
 
+def _rows(width: int, kind: type = float):
+    shape = (0, width) if width else (0,)
+    return field(default_factory=lambda: np.zeros(shape, kind))
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """What touches what, found once and kept for some iterations; distances are those of ``PolishSettings``."""
+
+    vertex: NDArray = _rows(0, int)
+    """(K,) vertices that stay above a plane."""
+    point: NDArray = _rows(3)
+    """(K, 3) a point of each plane [m]."""
+    normal: NDArray = _rows(3)
+    """(K, 3) unit normals: the side where the vertex belongs."""
+    pair: NDArray = _rows(2, int)
+    """(P, 2) vertices kept apart."""
+    apart: NDArray = _rows(0)
+    """(P,) the distance that they keep [m]."""
+    over: NDArray = _rows(4, int)
+    """(O, 4) a vertex, and the corners of the cloth's face that it lies over."""
+    weights: NDArray = _rows(3)
+    """(O, 3) barycentric weights of the point of that face."""
+    direction: NDArray = _rows(3)
+    """(O, 3) unit vectors: the side of the face where the vertex belongs."""
+
+    @staticmethod
+    def join(parts: Sequence[Contacts]) -> Contacts:
+        """All contacts of all parts."""
+        return Contacts(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Contacts)))
+
+
 @wp.struct
 class _Elastic:
     faces: wp.array(dtype=wp.vec3i)
@@ -63,8 +95,11 @@ class _Contacts:
     point: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3d)
     pair: wp.array(dtype=wp.vec2i)
+    apart: wp.array(dtype=wp.float64)
+    over: wp.array(dtype=wp.vec4i)
+    weights: wp.array(dtype=wp.vec3d)
+    direction: wp.array(dtype=wp.vec3d)
     offset: wp.float64
-    apart: wp.float64
     stiffness: wp.float64
 
 
@@ -148,12 +183,24 @@ def _evaluate(
         p = c.pair[k]
         away = x[p[0]] - x[p[1]]
         distance = wp.length(away)
-        depth = c.apart - distance
+        depth = c.apart[k] - distance
         if depth > wp.float64(0.0) and distance > wp.float64(1.0e-9):
             total += c.stiffness * depth * depth
             push = away * (two * c.stiffness * depth / distance)
             g[p[0]] = g[p[0]] - push
             g[p[1]] = g[p[1]] + push
+    for k in range(c.over.shape[0]):
+        o = c.over[k]
+        w = c.weights[k]
+        below = x[o[1]] * w[0] + x[o[2]] * w[1] + x[o[3]] * w[2]
+        depth = c.offset - wp.dot(x[o[0]] - below, c.direction[k])
+        if depth > wp.float64(0.0):
+            total += c.stiffness * depth * depth
+            push = c.direction[k] * (two * c.stiffness * depth)
+            g[o[0]] = g[o[0]] - push
+            g[o[1]] = g[o[1]] + push * w[0]
+            g[o[2]] = g[o[2]] + push * w[1]
+            g[o[3]] = g[o[3]] + push * w[2]
     out[0] = total
 
 
@@ -174,17 +221,22 @@ class ElasticEnergy:
         self.x = wp.zeros(count, dtype=wp.vec3d, device=DEVICE)
         self.gradient = wp.zeros(count, dtype=wp.vec3d, device=DEVICE)
         self.out = wp.zeros(1, dtype=wp.float64, device=DEVICE)
-        none = np.zeros((0, 3))
-        self.touch(np.zeros(0, np.int64), none, none, np.zeros((0, 2), np.int64), PolishSettings())
+        self.touch(Contacts(), PolishSettings())
 
-    def touch(self, vertex: NDArray, point: NDArray, normal: NDArray, pairs: NDArray, s: PolishSettings) -> None:
-        """Planes (``point``, ``normal``) (K, 3) that vertices (K,) stay above, and vertex pairs (P, 2) kept apart."""
+    def touch(self, contacts: Contacts, s: PolishSettings) -> None:
+        """Set what is in contact, and at which distances."""
+
+        def doubles(a: NDArray, dtype):
+            return wp.array(np.ascontiguousarray(a, np.float64), dtype=dtype, device=DEVICE)
+
         c = _Contacts()
-        c.vertex = wp.array(vertex.astype(np.int32), dtype=int, device=DEVICE)
-        c.point = wp.array(np.ascontiguousarray(point, np.float64), dtype=wp.vec3d, device=DEVICE)
-        c.normal = wp.array(np.ascontiguousarray(normal, np.float64), dtype=wp.vec3d, device=DEVICE)
-        c.pair = wp.array(pairs.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
-        c.offset, c.apart, c.stiffness = s.offset, s.apart, s.stiffness
+        c.vertex = wp.array(contacts.vertex.astype(np.int32), dtype=int, device=DEVICE)
+        c.point, c.normal = doubles(contacts.point, wp.vec3d), doubles(contacts.normal, wp.vec3d)
+        c.pair = wp.array(contacts.pair.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
+        c.apart = doubles(contacts.apart, wp.float64)
+        c.over = wp.array(contacts.over.astype(np.int32), dtype=wp.vec4i, device=DEVICE)
+        c.weights, c.direction = doubles(contacts.weights, wp.vec3d), doubles(contacts.direction, wp.vec3d)
+        c.offset, c.stiffness = s.offset, s.stiffness
         self.contacts = c
 
     def __call__(self, x: NDArray) -> tuple[float, NDArray]:
@@ -210,10 +262,10 @@ def polish(
         away = (x - on) * sign[:, None]
         distance = np.linalg.norm(away, axis=1)
         near = np.flatnonzero((distance < s.reach) & (distance > 1e-7))
-        planes = [(near, on[near], away[near] / distance[near, None]), *_holds(x, limits, level, s)]
+        planes = Contacts(vertex=near, point=on[near], normal=away[near] / distance[near, None])
         pairs = close_strangers(x, limits.rest, s.apart)
-        vertex, point, normal = (np.concatenate(column) for column in zip(*planes))
-        energy.touch(vertex, point, normal, pairs, s)
+        apart = Contacts(pair=pairs, apart=np.full(len(pairs), s.apart))
+        energy.touch(Contacts.join([planes, *_holds(x, limits, level, s), apart]), s)
         x = lbfgs(energy, x, s.iterations)
     return x
 
@@ -223,27 +275,45 @@ def _holds(x: NDArray, limits: Constraints, level: float, s: PolishSettings):
     held = limits.held
     for direction in (1.0, -1.0):
         normal = np.tile([0.0, direction, 0.0], (len(held), 1))
-        yield held, np.tile([0.0, level - direction * s.offset, 0.0], (len(held), 1)), normal
+        point = np.tile([0.0, level - direction * s.offset, 0.0], (len(held), 1))
+        yield Contacts(vertex=held, point=point, normal=normal)
     if limits.side is not None:
         legs = np.flatnonzero(limits.side)
         normal = np.column_stack([limits.side[legs], np.zeros((len(legs), 2))])
-        yield legs, normal * (s.middle - s.offset), normal
+        yield Contacts(vertex=legs, point=normal * (s.middle - s.offset), normal=normal)
 
 
 def lbfgs(
-    function: Callable[[NDArray], tuple[float, NDArray]], x: NDArray, iterations: int, memory: int = 10
+    function: Callable[[NDArray], tuple[float, NDArray]],
+    x: NDArray,
+    iterations: int,
+    memory: int = 10,
+    precondition: Callable[[NDArray], NDArray] | None = None,
+    longest: float = 0.005,
 ) -> NDArray:
-    """Minimise by L-BFGS with backtracking (Nocedal & Wright, algorithms 7.4, 3.1); never ends higher than it began."""
+    """Minimise by L-BFGS with backtracking (Nocedal & Wright, algorithms 7.4, 3.1); never ends higher than it began.
+
+    Args:
+        function: x -> value and gradient.
+        x: the start, any shape.
+        iterations: most steps taken.
+        memory: pairs kept.
+        precondition: multiplies by an inverse stand-in for the Hessian; without it, a multiple of the identity.
+        longest: with ``precondition``, no entry of x moves further than this in one step.
+    """
     value, gradient = function(x)
     steps: list[tuple[NDArray, NDArray, float]] = []
     for _ in range(iterations):
-        direction = -_two_loops(gradient, steps)
+        direction = -_two_loops(gradient, steps, precondition)
         slope = float((direction * gradient).sum())
         if slope >= 0:
-            steps, direction = [], -gradient
-            slope = -float((gradient * gradient).sum())
-        # The first step has no scale yet: a tenth of a millimetre at most.
-        length = 1.0 if steps else min(1.0, 1e-4 / max(float(np.abs(direction).max()), 1e-30))
+            steps = []
+            direction = -gradient if precondition is None else -precondition(gradient)
+            slope = float((direction * gradient).sum())
+        reach = max(float(np.abs(direction).max()), 1e-30)
+        # The first plain step has no scale yet: a tenth of a millimetre at most.
+        bound = longest if precondition is not None else (np.inf if steps else 1e-4)
+        length = min(1.0, bound / reach)
         for _ in range(12):
             new = x + length * direction
             new_value, new_gradient = function(new)
@@ -260,12 +330,18 @@ def lbfgs(
     return x
 
 
-def _two_loops(gradient: NDArray, steps: list[tuple[NDArray, NDArray, float]]) -> NDArray:
+def _two_loops(
+    gradient: NDArray,
+    steps: list[tuple[NDArray, NDArray, float]],
+    precondition: Callable[[NDArray], NDArray] | None = None,
+) -> NDArray:
     q, alphas = gradient.copy(), []
     for s, y, rho in reversed(steps):
         alphas.append(rho * float((s * q).sum()))
         q -= alphas[-1] * y
-    if steps:
+    if precondition is not None:
+        q = precondition(q)
+    elif steps:
         s, y, rho = steps[-1]
         q *= 1 / (rho * float((y * y).sum()))
     for (s, y, rho), alpha in zip(steps, reversed(alphas)):

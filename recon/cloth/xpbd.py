@@ -7,11 +7,15 @@ launch per constraint colour. Parallelism comes from one process a garment.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+
+from recon.cloth.energies import Cloth
+from recon.types import Garment
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -63,6 +67,50 @@ class Constraints:
     """(H,) vertices of a waistband, held level at its mean height."""
     side: NDArray | None = None
     """(V,) 1 left leg, -1 right leg, 0 neither: legs keep to their side of the body's middle plane."""
+
+    @classmethod
+    def from_garment(cls, garment: Garment, cloth: Cloth, held: NDArray | None = None) -> Constraints:
+        """Edges and bends of a garment's cloth; ``held`` (H,) vertices of its waistband."""
+        return cls(
+            edges=cloth.edges.numpy(),
+            edge_lengths=cloth.edge_lengths.double().numpy(),
+            bends=cloth.hinges[:, 2:].numpy(),
+            bend_lengths=_flat_spans(cloth),
+            rest=_panel_positions(garment),
+            held=np.zeros(0, np.int64) if held is None else held,
+        )
+
+
+def _panel_positions(garment: Garment) -> NDArray:
+    """(V, 3) flat positions with a metre between the panels; seam vertices lie with the front."""
+    vertex, points = garment.vertex_of_point.numpy(), garment.panel_points.detach().double().numpy()
+    out = np.zeros((int(vertex.max()) + 1, 3))
+    for panel in (1, 0):
+        mine = np.unique(garment.panel_faces[garment.panel_of_face == panel].numpy())
+        out[vertex[mine], :2] = points[mine]
+        out[vertex[mine], 2] = -float(panel)
+    return out
+
+
+def _flat_spans(cloth: Cloth) -> NDArray:
+    """(H,) distance between the vertices opposite of each hinge when it lies flat [m]."""
+    hinges = cloth.hinges.numpy()
+    edges, lengths = cloth.edges.numpy(), cloth.edge_lengths.double().numpy()
+    count = int(edges.max()) + 1
+    keys = edges[:, 0] * count + edges[:, 1]  # sorted, as edges are
+
+    def length(a: NDArray, b: NDArray) -> NDArray:
+        return lengths[np.searchsorted(keys, np.minimum(a, b) * count + np.maximum(a, b))]
+
+    a, b, c, d = hinges.T
+    base = length(a, b)
+    feet, heights = [], []
+    for tip in (c, d):
+        to_a, to_b = length(a, tip), length(b, tip)
+        along = (to_a**2 - to_b**2 + base**2) / (2 * base)
+        feet.append(along)
+        heights.append(np.sqrt(np.maximum(to_a**2 - along**2, 1e-12)))
+    return np.hypot(feet[0] - feet[1], heights[0] + heights[1])
 
 
 @wp.struct
@@ -173,12 +221,65 @@ def body_mesh(vertices: NDArray, faces: NDArray) -> wp.Mesh:
 def settle(start: NDArray, constraints: Constraints, body: wp.Mesh, settings: Settings | None = None) -> NDArray:
     """(V, 3) positions of a garment at rest on the body, from its placed ones ``start`` (V, 3) [m]."""
     s = settings or Settings()
-    cloth, pairs = _allocate(start, constraints, s)
-    state = _State(cloth, pairs, len(start), constraints, body, s)
+    state = _begin(start, constraints, body, s)
     _run(state, s.fit_steps, gravity=0.0, damping=0.96, friction=0.02, search=8, limit=1.5)
     _run(state, s.fall_steps, gravity=9.81, damping=0.997, friction=s.friction, search=16, limit=3.0)
     _run(state, s.rest_steps, gravity=9.81, damping=0.97, friction=s.friction, search=20, limit=3.0)
-    return cloth.x.numpy().astype(np.float64)
+    return state.cloth.x.numpy().astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Carry:
+    """How a garment is carried along by a moving body."""
+
+    first_steps: int = 200
+    """Substeps before the body moves."""
+    steps: int = 16
+    """Substeps per frame."""
+    last_steps: int = 200
+    """Substeps after it moved."""
+    damping: float = 0.9
+    """Share of the velocity that a substep keeps: the motion is quasi-static."""
+    friction: float = 0.1
+    """Coulomb friction while the body moves."""
+
+
+def carry(
+    transport: NDArray,
+    constraints: Constraints,
+    frames: Sequence[NDArray],
+    faces: NDArray,
+    settings: Settings | None = None,
+    how: Carry | None = None,
+) -> Iterator[NDArray]:
+    """Carry a garment from the body's first frame to its last; yields its (V, 3) positions after each frame [m].
+
+    Between frames the cloth first moves as ``transport`` does, then relaxes: so it neither lags behind nor is dragged
+    along by contact alone, and folds grow as the pose does.
+
+    Args:
+        transport: (T, V, 3) where skinning alone takes the garment [m]; its first frame is the start.
+        constraints: the garment's; a waistband keeps the height that ``transport`` gives it.
+        frames: T arrays (B, 3) of what it collides with: the body and layers beneath [m].
+        faces: (F, 3) of those, outward.
+    """
+    s, how = settings or Settings(), how or Carry()
+    mesh = body_mesh(frames[0], faces)
+    state = _begin(transport[0], constraints, mesh, s)
+    state.cloth.held_y.numpy()[:] = transport[0, constraints.held, 1]
+    still = {"gravity": 9.81, "damping": how.damping, "search": 8, "limit": 1.5}
+    _run(state, how.first_steps, friction=how.friction, **still)
+    yield state.cloth.x.numpy().astype(np.float64)
+    for k in range(1, len(frames)):
+        mesh.points.numpy()[:] = frames[k]
+        mesh.refit()
+        state.cloth.x.numpy()[:] += (transport[k] - transport[k - 1]).astype(np.float32)
+        state.cloth.held_y.numpy()[:] = transport[k, constraints.held, 1]
+        last = k + 1 == len(frames)
+        _run(state, how.steps, friction=how.friction, **still)
+        if last:
+            _run(state, how.last_steps, friction=s.friction, **still)
+        yield state.cloth.x.numpy().astype(np.float64)
 
 
 @dataclass
@@ -230,6 +331,11 @@ def close_strangers(x: NDArray, rest: NDArray, distance: float) -> NDArray:
         return pairs.reshape(0, 2)
     far = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 2.5 * distance
     return pairs[far]
+
+
+def _begin(start: NDArray, constraints: Constraints, body: wp.Mesh, s: Settings) -> _State:
+    cloth, pairs = _allocate(start, constraints, s)
+    return _State(cloth, pairs, len(start), constraints, body, s)
 
 
 def _allocate(start: NDArray, constraints: Constraints, s: Settings) -> tuple[_Cloth, int]:

@@ -32,6 +32,9 @@ NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Garment name that a user may give -> its kind and the variants that the name allows."""
 
+WAISTED = ("trousers", "skirt")
+"""Kinds that a waistband holds up."""
+
 DECODERS: dict[str, str] = {"isp": "recon.garments.isp:load_isp"}
 """Decoder name -> ``module:function`` of (kind, folder, device)."""
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from recon.types import Garment
 from scipy import ndimage
 
 SNAP = 0.25
@@ -190,6 +192,13 @@ def border_loops(faces: NDArray) -> list[NDArray]:
             vertex = following.pop(vertex)
         loops.append(np.array(loop))
     return sorted(loops, key=len, reverse=True)
+
+
+def waistband(garment: Garment) -> NDArray:
+    """(H,) vertices of the highest open border of a garment: the waistband of trousers and skirts."""
+    loops = border_loops(garment.mesh.faces.cpu().numpy())
+    heights = garment.mesh.vertices.detach().cpu().numpy()[:, 1]
+    return max(loops, key=lambda loop: heights[loop].mean())
 
 
 def signed_areas(points: NDArray, faces: NDArray) -> NDArray:

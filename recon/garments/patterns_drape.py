@@ -119,47 +119,10 @@ class FittingRoom:
 def constraints(pattern: Pattern, garment: Garment, cloth: Cloth) -> Constraints:
     """What the simulator needs to know of a garment."""
     vertex = garment.vertex_of_point.numpy()
-    hinges = cloth.hinges.numpy()
-    return Constraints(
-        edges=cloth.edges.numpy(),
-        edge_lengths=cloth.edge_lengths.double().numpy(),
-        bends=hinges[:, 2:],
-        bend_lengths=_flat_spans(cloth),
-        rest=_pattern_positions(pattern, vertex),
-        held=np.unique(vertex[pattern.held]),
+    return replace(
+        Constraints.from_garment(garment, cloth, np.unique(vertex[pattern.held])),
         side=_leg_sides(pattern, vertex) if pattern.kind == "trousers" else None,
     )
-
-
-def _flat_spans(cloth: Cloth) -> NDArray:
-    """(H,) distance between the vertices opposite of each hinge when it lies flat [m]."""
-    hinges = cloth.hinges.numpy()
-    edges, lengths = cloth.edges.numpy(), cloth.edge_lengths.double().numpy()
-    count = int(edges.max()) + 1
-    keys = edges[:, 0] * count + edges[:, 1]  # sorted, as edges are
-
-    def length(a: NDArray, b: NDArray) -> NDArray:
-        return lengths[np.searchsorted(keys, np.minimum(a, b) * count + np.maximum(a, b))]
-
-    a, b, c, d = hinges.T
-    base = length(a, b)
-    feet, heights = [], []
-    for tip in (c, d):
-        to_a, to_b = length(a, tip), length(b, tip)
-        along = (to_a**2 - to_b**2 + base**2) / (2 * base)
-        feet.append(along)
-        heights.append(np.sqrt(np.maximum(to_a**2 - along**2, 1e-12)))
-    return np.hypot(feet[0] - feet[1], heights[0] + heights[1])
-
-
-def _pattern_positions(pattern: Pattern, vertex: NDArray) -> NDArray:
-    """(V, 3) flat positions with a metre between the panels; seam vertices lie with the front."""
-    out = np.zeros((vertex.max() + 1, 3))
-    for panel in (1, 0):
-        mine = pattern.panel_of_point == panel
-        out[vertex[mine], :2] = pattern.points[mine]
-        out[vertex[mine], 2] = -float(panel)
-    return out
 
 
 def _leg_sides(pattern: Pattern, vertex: NDArray) -> NDArray:

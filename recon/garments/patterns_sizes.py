@@ -21,9 +21,9 @@ SKIN = 2 * np.pi * 0.0035
 def top(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a tank, tshirt, shirt or jacket."""
     fit = rng.beta(1.1, 1.3)
-    low, high = {"tank": (0.022, 0.055), "tshirt": (0.023, 0.082), "shirt": (0.023, 0.090), "jacket": (0.030, 0.095)}[
-        variant
-    ]
+    # Woven cloth tighter than this across the chest would have to stretch, most of all with long sleeves set in.
+    ease = {"tank": (0.022, 0.055), "tshirt": (0.028, 0.082), "shirt": (0.035, 0.090), "jacket": (0.038, 0.095)}
+    low, high = ease[variant]
     p = _shoulders(variant, rng, m, fit, low + fit * (high - low))
     if variant == "jacket":
         p["opening"] = rng.uniform(0.050, 0.060)
@@ -51,7 +51,8 @@ def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a one-piece dress: sleeveless, short or long sleeves, mini to maxi, fitted to loose."""
     fit = rng.beta(1.0, 1.6)
     style = rng.choice(["tank", "tshirt", "shirt"], p=[0.4, 0.35, 0.25])
-    p = _shoulders(style, rng, m, fit, 0.022 + 0.05 * fit)
+    least = {"tank": 0.026, "tshirt": 0.030, "shirt": 0.036}[style]
+    p = _shoulders(style, rng, m, fit, least + 0.046 * fit)
     p["hem_y"] = _pick(
         rng,
         [
@@ -64,7 +65,7 @@ def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     p["hip_x"] = _trunk(m, m.hip_y) + 0.008 + 0.05 * fit + rng.uniform(0, 0.02)
     flare = rng.choice([rng.uniform(0.0, 0.08), rng.uniform(0.08, 0.32)])
     p["hem_x"] = max(_trunk(m, p["hem_y"]) + 0.012, p["hip_x"] + flare * (m.hip_y - p["hem_y"]))
-    _waist(p, rng, m, fitted=rng.uniform(0.2, 1.0) * (1 - 0.7 * fit))
+    _waist(p, rng, m, fitted=rng.uniform(0.1, 0.65) * (1 - 0.7 * fit))
     p["hem_drop"] = 0.28 * (p["hem_x"] - p["hip_x"]) * rng.uniform(0.6, 1.1)
     _yoke(p, m)
     _clear(p, m, shapes.bodice_side(p) if "chest_x" in p else shapes.skirt_side(p), 0.005)

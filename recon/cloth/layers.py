@@ -1,0 +1,180 @@
+"""Garments worn over each other on one body, at rest: elastic energy, gravity, and contact with body and each other.
+
+Contact between layers acts on both: an outer vertex pushes the face that it lies over, and the face it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import Cloth
+from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings
+from recon.cloth.xpbd import Constraints, close_strangers
+
+ON_BORDER = 1e-3
+"""Corners of a face with less weight than this play no part in a closest point."""
+LAYER_REACH = 0.02
+"""Layers further apart than this, or deeper in each other, don't touch [m]."""
+SAME_WAY = 0.5
+"""A vertex lies under a face only if their normals agree by this cosine: a sleeve beside the hip covers nothing."""
+
+
+class LayeredCloth:
+    """Energy [J] and gradient [N] of garments worn over each other; positions are stacked, outermost first.
+
+    Contacts are those of the last :meth:`touch`.
+    """
+
+    def __init__(
+        self,
+        cloths: Sequence[Cloth],
+        limits: Sequence[Constraints],
+        body: BodyContact,
+        settings: PolishSettings | None = None,
+    ):
+        """
+        Args:
+            cloths: rest states in double precision and of one fabric, outermost first, on the CPU.
+            limits: for each its flat positions (which parts are strangers) and waistband (which keeps its height).
+            body: the body, on the CPU.
+            settings: contact distances and stiffness; ``apart`` counts in mean edge lengths here.
+        """
+        self.limits, self.body = list(limits), body
+        self.settings = settings or PolishSettings(apart=0.5)
+        self.apart = [self.settings.apart * float(k.edge_lengths.mean()) for k in self.limits]
+        self.faces = [c.faces for c in cloths]
+        self.rims = [_rim(c) for c in cloths]
+        self.starts = np.cumsum([0, *[len(c.masses) for c in cloths]])
+        self.cloth = stack(cloths)
+        self.energy = ElasticEnergy(self.cloth)
+        self.laplacian = _laplacian(self.cloth)
+        self.levels: list[NDArray] = []
+        self.touching = np.zeros(self.starts[-1])
+
+    def split(self, x: NDArray) -> list[NDArray]:
+        """(V, 3) stacked positions -> one array per layer."""
+        return [x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
+
+    def hold(self, x: NDArray) -> None:
+        """From now on waistbands keep the height of each of their vertices in ``x``."""
+        self.levels = [part[k.held].copy() for part, k in zip(self.split(x), self.limits)]
+
+    def touch(self, x: NDArray) -> None:
+        """Find what is close to what at ``x`` (V, 3)."""
+        parts = self.split(x)
+        found = [self._body(x), *self._holds()]
+        for k, part in enumerate(parts):
+            pair = close_strangers(part, self.limits[k].rest, self.apart[k])
+            found.append(Contacts(pair=pair + self.starts[k], apart=np.full(len(pair), self.apart[k])))
+            for j in range(k + 1, len(parts)):
+                found += [self._over(parts, k, j), self._under(parts, j, k)]
+        contacts = Contacts.join(found)
+        self.energy.touch(contacts, self.settings)
+        depth = ((x[contacts.vertex] - contacts.point) * contacts.normal).sum(1)
+        on = contacts.vertex[depth < 1.5 * self.settings.offset]
+        self.touching = np.minimum(np.bincount(on, minlength=len(x)), 2)
+
+    def __call__(self, x: NDArray) -> tuple[float, NDArray]:
+        """Energy and gradient (V, 3) at ``x`` (V, 3)."""
+        return self.energy(x)
+
+    def preconditioner(self) -> Callable[[NDArray], NDArray]:
+        """Multiplies (V, 3) by the inverse of a constant stand-in for the Hessian: springs along edges, and contacts.
+
+        It lets L-BFGS start where the stiffness is (Liu et al. 2017, "Quasi-Newton Methods for Real-Time Simulation
+        of Hyperelastic Materials").
+        """
+        fabric = self.cloth.fabric
+        spring = fabric.thickness * (2 * fabric.lame_mu + fabric.lame_lambda)
+        diagonal = 2 * self.settings.stiffness * self.touching + 0.02 * spring
+        return splu((spring * self.laplacian + sp.diags(diagonal)).tocsc()).solve
+
+    def _body(self, x: NDArray) -> Contacts:
+        """Planes of the body close to the cloth."""
+        _, _, on, away, distance = _closest(self.body, x)
+        near = np.flatnonzero((distance < self.settings.reach) & (distance > 1e-7))
+        return Contacts(vertex=near, point=on[near], normal=away[near] / distance[near, None])
+
+    def _holds(self):
+        """Two facing planes hold each waistband vertex at its height, and leave it its way around the body."""
+        for start, limits, level in zip(self.starts, self.limits, self.levels):
+            for direction in (1.0, -1.0):
+                normal = np.tile([0.0, direction, 0.0], (len(level), 1))
+                yield Contacts(
+                    vertex=limits.held + start, point=level - self.settings.offset * normal, normal=normal
+                )
+
+    def _over(self, parts: list[NDArray], k: int, j: int) -> Contacts:
+        """Vertices of layer k near layer j beneath it: they stay outside of its faces."""
+        surface = BodyContact(torch.tensor(parts[j]), self.faces[j])
+        corners, weights, _, away, distance = _closest(surface, parts[k])
+        near = (distance < LAYER_REACH) & (distance > 1e-7)
+        near &= ~(self.rims[j][corners] | (weights < ON_BORDER)).all(1)  # beside an open border there are no sides
+        chosen = np.flatnonzero(near)
+        over = np.column_stack([chosen + self.starts[k], corners[chosen] + self.starts[j]])
+        return Contacts(over=over, weights=weights[chosen], direction=away[chosen] / distance[chosen, None])
+
+    def _under(self, parts: list[NDArray], k: int, j: int) -> Contacts:
+        """Vertices of layer k near layer j above it that face the same way: they stay inside of its faces."""
+        found = self._over(parts, k, j)
+        own = _vertex_normals(parts[k], self.faces[k].numpy())[found.over[:, 0] - self.starts[k]]
+        same = (own * found.direction).sum(1) > SAME_WAY
+        return Contacts(over=found.over[same], weights=found.weights[same], direction=-found.direction[same])
+
+
+def stack(cloths: Sequence[Cloth]) -> Cloth:
+    """Several cloths of one fabric as one."""
+    starts = np.cumsum([0, *[len(c.masses) for c in cloths]])
+
+    def joined(name: str, shifted: bool = False) -> Tensor:
+        return torch.cat([getattr(c, name) + (int(n) if shifted else 0) for c, n in zip(cloths, starts)])
+
+    moved = {name: joined(name, True) for name in ("faces", "edges", "hinges")}
+    same = {name: joined(name) for name in ("inverse", "areas", "edge_lengths", "hinge_weights", "masses")}
+    return Cloth(**moved, **same, fabric=cloths[0].fabric)
+
+
+def _closest(surface: BodyContact, x: NDArray) -> tuple[NDArray, ...]:
+    """For points (V, 3): corners and weights (V, 3) of the closest point, the point, the way from it to its outside."""
+    face, weights, sign = (t.numpy() for t in surface.closest(torch.from_numpy(x)))
+    corners = surface.faces.numpy()[face]
+    on = (surface.vertices.numpy()[corners] * weights[..., None]).sum(1)
+    away = (x - on) * sign[:, None]
+    return corners, weights, on, away, np.linalg.norm(away, axis=1)
+
+
+def _vertex_normals(x: NDArray, faces: NDArray) -> NDArray:
+    """(V, 3) unit normals, weighted by area."""
+    corners = x[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    out = np.zeros_like(x)
+    for k in range(3):
+        np.add.at(out, faces[:, k], normals)
+    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
+
+
+def _laplacian(cloth: Cloth) -> sp.csr_matrix:
+    """(V, V) combinatorial Laplacian of the cloth's edges."""
+    edges, count = cloth.edges.numpy(), len(cloth.masses)
+    ones = np.ones(len(edges))
+    half = sp.coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(count, count))
+    both = (half + half.T).tocsr()
+    return sp.diags(np.asarray(both.sum(1)).ravel()) - both
+
+
+def _rim(cloth: Cloth) -> NDArray:
+    """(V,) whether a vertex lies on an open border: at an edge without a hinge."""
+    count = len(cloth.masses)
+    inner = cloth.hinges[:, :2].sort(1).values.numpy() @ [count, 1]
+    edges = cloth.edges.numpy()
+    rim = np.zeros(count, bool)
+    rim[edges[~np.isin(edges @ [count, 1], inner)]] = True
+    return rim

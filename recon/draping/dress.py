@@ -1,0 +1,100 @@
+"""Dressing by simulation: garments put on in the T pose and carried into the body's pose, the innermost first.
+
+Skinning says where the cloth is taken, the simulator lets it relax on the way: folds form as the pose does, and cloth
+that would be stretched or pressed through itself by skinning in one step is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from recon.bodies import Body
+from recon.cloth.energies import Cloth
+from recon.cloth.xpbd import Carry, Constraints, Settings, carry
+from recon.draping.skinning import SkinningDraper
+from recon.garments import WAISTED
+from recon.garments.panels import waistband
+from recon.types import BodyPose, Garment, Mesh
+
+
+@dataclass(frozen=True)
+class Dressing:
+    """How garments are carried into a pose."""
+
+    frames: int = 48
+    """Poses on the way from T to the wanted one."""
+    steps: int = 16
+    """Simulation substeps per frame."""
+    bend_compliance: float = 1e-5
+    """Compliance of the distances across edges: stiff enough that coarse cloth does not crumple."""
+    self_distance: float = 0.6
+    """Distance that parts of the cloth keep from each other, in mean edge lengths."""
+    offset: float = 0.004
+    """Distance kept from the body and from the layer beneath [m]."""
+
+
+def limits_of(garment: Garment) -> Constraints:
+    """What the simulator needs to know of a garment: its cloth, flat panels and waistband."""
+    held = waistband(garment) if garment.kind in WAISTED else None
+    return Constraints.from_garment(garment, Cloth.from_garment(garment), held)
+
+
+@torch.no_grad()
+def dress(
+    garments: Sequence[Garment],
+    body: Body,
+    pose: BodyPose,
+    skinning: SkinningDraper,
+    settings: Dressing | None = None,
+    tick: Callable[[int, float], None] | None = None,
+) -> list[NDArray]:
+    """Garments worn over each other by one body, at rest in its pose.
+
+    Args:
+        garments: outermost first, on the CPU, with panels that fit the body's shape (``grade``).
+        body: the body model.
+        pose: one body (batch of one).
+        skinning: where the cloth is taken without simulation.
+        settings: see :class:`Dressing`.
+        tick: hears (frame, 0) after each frame of each garment.
+
+    Returns:
+        (V, 3) vertices of each garment, double precision [m].
+    """
+    s = settings or Dressing()
+    posed = body.pose(_way(pose, s.frames))
+    frames, faces = posed.mesh.vertices.cpu().numpy(), body.faces.cpu().numpy()
+    simulation = Settings(bend_compliance=s.bend_compliance, self_distance=s.self_distance, offset=s.offset)
+    ends: list[NDArray] = []
+    for garment in reversed(garments):
+        skinned = skinning.drape_vertices(garment.mesh, posed).double().cpu().numpy()
+        own = []
+        for k, x in enumerate(carry(skinned, limits_of(garment), frames, faces, simulation, Carry(steps=s.steps))):
+            own.append(x)
+            if tick:
+                tick(k, 0.0)
+        ends.append(own[-1])
+        # What lies beneath is part of what the next garment collides with.
+        faces = np.concatenate([faces, garment.mesh.faces.cpu().numpy() + frames.shape[1]])
+        frames = np.concatenate([frames, np.stack(own).astype(np.float32)], 1)
+    return ends[::-1]
+
+
+def neutral(pose: BodyPose) -> BodyPose:
+    """The same body in the T pose."""
+    return replace(pose, pose=torch.zeros_like(pose.pose))
+
+
+def _way(pose: BodyPose, count: int) -> BodyPose:
+    """(count + 1) bodies from T (turned and placed as in the end) to the pose."""
+    share = torch.linspace(0, 1, count + 1, dtype=pose.pose.dtype, device=pose.pose.device)
+    joints = pose.pose * share[:, None, None]
+    joints[:, 0] = pose.pose[:, 0]
+    many = count + 1
+    return BodyPose(pose.shape.expand(many, -1), joints, pose.translation.expand(many, -1))

@@ -1,0 +1,76 @@
+"""Pattern grading: panels cut for the neutral body made to fit another body, seams still matching.
+
+Tailors grade a pattern by moving its points along smooth rules. Here the rule is one map of the panels' common plane, a
+polynomial of low degree: front and back move alike, so that seams that matched in length still do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import comb
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.cloth.solve import lbfgs
+from recon.types import Garment
+
+DEGREE = 3
+"""Degree of the map along each axis of the plane."""
+OUTLIER = 0.15
+"""Green strain beyond which a triangle pulls no harder."""
+STIFFNESS = 1e-3
+"""Weight of the map's own unevenness, against what the cloth does not need."""
+
+
+def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
+    """The garment with panels that would lie over ``worn`` with the least strain.
+
+    Args:
+        garment: welded, its panels cut for the neutral body.
+        worn: (V, 3) the same garment's vertices on the body that it shall fit, unposed [m].
+        iterations: L-BFGS iterations.
+
+    Returns:
+        The garment with new ``panel_points`` (detached); mesh and topology are untouched.
+    """
+    points = garment.panel_points.detach().double().cpu()
+    faces = garment.panel_faces.cpu()
+    mirrored = torch.where(garment.panel_of_face.cpu() == 1, -1.0, 1.0).double()
+    low, high = points.min(0).values, points.max(0).values
+    basis = _bernstein((points - low) / (high - low))
+    sides = _sides(worn.detach().double().cpu()[garment.mesh.faces.cpu()])
+    metric = sides.transpose(1, 2) @ sides
+    areas = torch.linalg.det(_sides(points[faces])).abs() / 2
+    sound = areas > 0.05 * areas.mean()  # slivers say more about the meshing than about the cloth
+    faces, metric, mirrored, weights = faces[sound], metric[sound], mirrored[sound], areas[sound] / areas[sound].sum()
+
+    @torch.enable_grad()
+    def energy(moves: np.ndarray) -> tuple[float, np.ndarray]:
+        c = torch.from_numpy(moves).requires_grad_()
+        rest = _sides((points + basis @ c)[faces]) * mirrored[:, None, None]
+        inverse = torch.linalg.inv(rest)
+        green = 0.5 * (inverse.transpose(1, 2) @ metric @ inverse - torch.eye(2, dtype=points.dtype))
+        misfit = (weights * torch.log1p(green.square().sum((1, 2)) / OUTLIER**2)).sum()
+        uneven = (c - c.mean(0)).square().sum() / float((high - low).max()) ** 2
+        loss = misfit + STIFFNESS * uneven
+        (gradient,) = torch.autograd.grad(loss, c)
+        return loss.item(), gradient.numpy()
+
+    moves = lbfgs(energy, np.zeros((basis.shape[1], 2)), iterations)
+    graded = points + basis @ torch.from_numpy(moves)
+    return replace(garment, panel_points=graded.to(garment.panel_points))
+
+
+def _sides(corners: Tensor) -> Tensor:
+    """(F, 3, D) triangles -> (F, D, 2) two of their sides as columns."""
+    return torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], -1)
+
+
+def _bernstein(at: Tensor) -> Tensor:
+    """(P, 2) points of the unit square -> (P, (DEGREE + 1)²) values of the tensor product basis."""
+    powers = torch.arange(DEGREE + 1, dtype=at.dtype)
+    factor = torch.tensor([comb(DEGREE, k) for k in range(DEGREE + 1)], dtype=at.dtype)
+    one = factor * at[..., None] ** powers * (1 - at[..., None]) ** (DEGREE - powers)
+    return (one[:, 0, :, None] * one[:, 1, None, :]).flatten(1)
