@@ -2,7 +2,7 @@
 
 The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
 simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
-overlap, all layers at once. Ends with no vertex and no face centre inside the body.
+overlap, all layers at once. Halfway the panels are graded again, to the cloth as the photo shows it. Ends with no vertex and no face centre inside the body.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from recon.cloth.solve import PolishSettings, lbfgs
 from recon.draping.dress import Dressing, dress, limits_of, neutral
 from recon.garments.grading import grade
 from recon.losses import soft_iou_loss
-from recon.types import Camera, Mesh, Photo, PosedBody, to_device
+from recon.types import Camera, Garment, Mesh, Photo, PosedBody, to_device
 
 
 @dataclass(frozen=True)
@@ -35,19 +35,19 @@ class Refinement:
 
     dressing: Dressing = field(default_factory=Dressing)
     """How the garments are put on and carried into the pose."""
-    settle: int = 40
-    """Minimisation steps of physics alone."""
-    rounds: int = 8
-    """Rounds of minimisation with the silhouettes; contacts are searched anew in each."""
-    steps: int = 10
+    settle: int = 30
+    """Minimisation steps of physics alone, at the start and after the panels were graded anew."""
+    rounds: int = 2
+    """Rounds of minimisation with the silhouettes before and after that; contacts are searched anew in each."""
+    steps: int = 25
     """Minimisation steps per round."""
     long_side: int = 288
     """Resolution of the silhouettes."""
-    evidence: float = 10.0
+    evidence: float = 60.0
     """Energy of a whole garment's overlap lost [J]: what the cloth would pay for it in strain."""
-    stretch: float = 10.0
+    stretch: float = 30.0
     """Factor on the fabric's membrane stiffness: ready-to-wear cloth hardly stretches."""
-    bend: float = 10.0
+    bend: float = 20.0
     """Factor on its bending stiffness: folds as wide as the mesh can show."""
     reach: float = 0.06
     """Body and layers are in each other's way within this distance [m]."""
@@ -113,6 +113,23 @@ def graded(layers: list[Layer], values: dict[str, Tensor], models: Models) -> li
     return [to_device(layer, torch.device("cpu")) for layer in cut]
 
 
+def cloth_of(garments: list[Garment], body: BodyContact, settings: Refinement) -> LayeredCloth:
+    """The physics of garments on the CPU, outermost first."""
+    fabric = Fabric().scaled(stretch=settings.stretch, bending=settings.bend)
+    cloths = [Cloth.from_garment(replace(g, panel_points=g.panel_points.double()), fabric) for g in garments]
+    contacts = PolishSettings(reach=settings.reach, apart=0.5)
+    return LayeredCloth(cloths, [limits_of(g) for g in garments], body, contacts)
+
+
+def _sum(physics: LayeredCloth, evidence: Evidence) -> Callable[[NDArray], tuple[float, NDArray]]:
+    def total(x: NDArray) -> tuple[float, NDArray]:
+        value, gradient = physics(x)
+        more, pull = evidence(physics.split(x))
+        return value + more, gradient + pull
+
+    return total
+
+
 def refine(
     values: dict[str, Tensor],
     layers: list[Layer],
@@ -139,31 +156,24 @@ def refine(
         posed = models.body.pose(to_body(values))
         layers = graded(layers, values, models)
     garments = [layer.garment for layer in layers]
-    start = dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick)
+    x = np.concatenate(dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick))
     device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
     body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
-    fabric = Fabric().scaled(stretch=settings.stretch, bending=settings.bend)
-    cloths = [Cloth.from_garment(replace(g, panel_points=g.panel_points.double()), fabric) for g in garments]
-    physics = LayeredCloth(
-        cloths, [limits_of(g) for g in garments], body, PolishSettings(reach=settings.reach, apart=0.5)
-    )
     at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
     camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
     evidence = Evidence(posed, faces, at, camera, models, settings.evidence)
-
-    def total(x: NDArray) -> tuple[float, NDArray]:
-        value, gradient = physics(x)
-        more, pull = evidence(physics.split(x))
-        return value + more, gradient + pull
-
-    x = np.concatenate(start)
-    physics.hold(x)
-    physics.touch(x)
-    x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
-    for number in range(settings.rounds):
+    for half in range(2):
+        physics = cloth_of(garments, body, settings)
+        physics.hold(x)
         physics.touch(x)
-        x = lbfgs(total, x, settings.steps, precondition=physics.preconditioner())
-        tick(number, physics(x)[0])
+        x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
+        for number in range(settings.rounds):
+            physics.touch(x)
+            x = lbfgs(_sum(physics, evidence), x, settings.steps, precondition=physics.preconditioner())
+            tick(half * settings.rounds + number, physics(x)[0])
+        if half == 0:  # what is still strained now was cut too short or too wide
+            garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, physics.split(x))]
+    layers = [replace(layer, garment=g) for layer, g in zip(layers, garments)]
     contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
     meshes = {}
     for layer, part, f in zip(layers, physics.split(x), faces):

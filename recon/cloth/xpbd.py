@@ -62,7 +62,8 @@ class Constraints:
     bend_lengths: NDArray
     """(B,) their distance in the flat cloth [m]."""
     rest: NDArray
-    """(V, 3) positions in the pattern, panels far apart: tells neighbours from strangers in self contact [m]."""
+    """(V, 3) positions in which neighbours are close (the pattern, its panels far apart; or the garment worn): tells
+    them from strangers in self contact [m]."""
     held: NDArray = field(default_factory=lambda: np.zeros(0, np.int64))
     """(H,) vertices of a waistband, held level at its mean height."""
     side: NDArray | None = None
@@ -236,12 +237,10 @@ class Carry:
     """Substeps before the body moves."""
     steps: int = 16
     """Substeps per frame."""
-    last_steps: int = 200
+    last_steps: int = 400
     """Substeps after it moved."""
-    damping: float = 0.9
+    damping: float = 0.97
     """Share of the velocity that a substep keeps: the motion is quasi-static."""
-    friction: float = 0.1
-    """Coulomb friction while the body moves."""
 
 
 def carry(
@@ -267,8 +266,8 @@ def carry(
     mesh = body_mesh(frames[0], faces)
     state = _begin(transport[0], constraints, mesh, s)
     state.cloth.held_y.numpy()[:] = transport[0, constraints.held, 1]
-    still = {"gravity": 9.81, "damping": how.damping, "search": 8, "limit": 1.5}
-    _run(state, how.first_steps, friction=how.friction, **still)
+    still = {"gravity": 9.81, "damping": how.damping, "friction": s.friction, "search": 8, "limit": 1.5}
+    _run(state, how.first_steps, **still)
     yield state.cloth.x.numpy().astype(np.float64)
     for k in range(1, len(frames)):
         mesh.points.numpy()[:] = frames[k]
@@ -276,9 +275,7 @@ def carry(
         state.cloth.x.numpy()[:] += (transport[k] - transport[k - 1]).astype(np.float32)
         state.cloth.held_y.numpy()[:] = transport[k, constraints.held, 1]
         last = k + 1 == len(frames)
-        _run(state, how.steps, friction=how.friction, **still)
-        if last:
-            _run(state, how.last_steps, friction=s.friction, **still)
+        _run(state, how.steps + (how.last_steps if last else 0), **still)
         yield state.cloth.x.numpy().astype(np.float64)
 
 
@@ -323,7 +320,7 @@ def held_height(x: NDArray, held: NDArray) -> float:
 
 
 def close_strangers(x: NDArray, rest: NDArray, distance: float) -> NDArray:
-    """(K, 2) vertex pairs closer than ``distance`` in space but further than 2.5 times that in the pattern."""
+    """(K, 2) vertex pairs closer than ``distance`` in space but further than 2.5 times that at rest."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(x).query_pairs(distance, output_type="ndarray")

@@ -27,22 +27,28 @@ from recon.types import BodyPose, Garment, Mesh
 class Dressing:
     """How garments are carried into a pose."""
 
-    frames: int = 48
+    frames: int = 40
     """Poses on the way from T to the wanted one."""
-    steps: int = 16
+    steps: int = 20
     """Simulation substeps per frame."""
     bend_compliance: float = 1e-5
     """Compliance of the distances across edges: stiff enough that coarse cloth does not crumple."""
     self_distance: float = 0.6
     """Distance that parts of the cloth keep from each other, in mean edge lengths."""
-    offset: float = 0.004
+    offset: float = 0.003
     """Distance kept from the body and from the layer beneath [m]."""
+    friction: float = 0.05
+    """Coulomb friction: little, so that cloth slips to where it is at ease, as it does while people dress."""
 
 
 def limits_of(garment: Garment) -> Constraints:
-    """What the simulator needs to know of a garment: its cloth, flat panels and waistband."""
+    """What the simulator needs to know of a garment: its cloth, its waistband, and which parts are strangers.
+
+    Strangers are told by the shape at rest on the body, where both sides of a seam are neighbours.
+    """
     held = waistband(garment) if garment.kind in WAISTED else None
-    return Constraints.from_garment(garment, Cloth.from_garment(garment), held)
+    limits = Constraints.from_garment(garment, Cloth.from_garment(garment), held)
+    return replace(limits, rest=garment.mesh.vertices.detach().double().numpy())
 
 
 @torch.no_grad()
@@ -70,7 +76,9 @@ def dress(
     s = settings or Dressing()
     posed = body.pose(_way(pose, s.frames))
     frames, faces = posed.mesh.vertices.cpu().numpy(), body.faces.cpu().numpy()
-    simulation = Settings(bend_compliance=s.bend_compliance, self_distance=s.self_distance, offset=s.offset)
+    simulation = Settings(
+        bend_compliance=s.bend_compliance, self_distance=s.self_distance, offset=s.offset, friction=s.friction
+    )
     ends: list[NDArray] = []
     for garment in reversed(garments):
         skinned = skinning.drape_vertices(garment.mesh, posed).double().cpu().numpy()
