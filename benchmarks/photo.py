@@ -1,11 +1,12 @@
 """The photo pipeline measured: the bundled photos, photos beside the repository, and outfits of known truth.
 
-    python benchmarks/photo.py                 # everything; JSON to docs/results/photo.json, tables to
-    docs/results/photo.md python benchmarks/photo.py --only demo     # one job; names are those of JOBS, or 'truth'
+    python benchmarks/photo.py                 # everything; to docs/results/photo.json and photo.md
+    python benchmarks/photo.py --only demo     # one job; names are those of JOBS, or 'truth'
 
 Each photo runs as a user would run it (``recon photo`` in a process of its own), so that its peak memory and time are
-its own. Outfits of known truth are test garments that no decoder has seen, skinned to unseen bodies and poses,
-rendered to masks; landmarks are the body's own points with 1 % noise. Perception is not part of those.
+its own. Outfits of known truth are test garments that no decoder has seen, graded to unseen bodies, carried into
+unseen poses by simulation and rendered to masks; landmarks are the body's own points with 1 % noise. Perception is not
+part of those.
 """
 
 from __future__ import annotations

@@ -16,7 +16,9 @@ from pipelines.measure import overlaps
 from pipelines.photo import PhotoFit, fit_evidence, load_models
 from pipelines.run import Run
 from recon.bodies.pose_prior import sample_poses
+from recon.draping.dress import dress, neutral
 from recon.garments.dataset import load_garments
+from recon.garments.grading import grade
 from recon.metrics import compare_meshes
 from recon.types import BodyPose, Camera, Mesh, Photo
 
@@ -46,7 +48,7 @@ def random_body(models: Models, generator: torch.Generator) -> BodyPose:
 
 
 def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
-    """Drape test garments by skinning, render their masks, and note the body's own landmarks with 1 % noise."""
+    """Dress the body in test garments by simulation, render their masks, and note the body's own landmarks with 1 % noise."""
     generator = torch.Generator().manual_seed(1000 + number)
     place = random_body(models, generator)
     camera = Camera(
@@ -57,11 +59,16 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
     )
     with torch.no_grad():
         posed = models.body.pose(place)
-        meshes = {}
+        unposed, garments = models.body.pose(neutral(place)), []
         for name in outfit:
             tests = [g for g in load_garments(models.decoders[name].kind, "test") if g.variant in models.variants[name]]
             garment = tests[number % len(tests)]
-            meshes[name] = Mesh(models.draper.drape(garment, posed).vertices[0], garment.mesh.faces)
+            garments.append(grade(garment, models.draper.drape(garment, unposed).vertices[0]))
+        worn = dress(garments, models.body, place, models.draper)
+        meshes = {
+            name: Mesh(torch.from_numpy(x).float(), g.mesh.faces)
+            for name, x, g in zip(outfit, worn, garments, strict=True)
+        }
         parts = [*meshes.values(), Mesh(posed.mesh.vertices[0], models.body.faces)]
         renderer = models.renderer_of(
             [m.faces for m in parts], list(range(len(parts))), [len(m.vertices) for m in parts]
