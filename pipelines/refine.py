@@ -2,7 +2,8 @@
 
 The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
 simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
-overlap, all layers at once. Halfway the panels are graded again, to the cloth as the photo shows it. Ends with no vertex and no face centre inside the body.
+overlap, all layers at once. Halfway the panels are graded again, to the cloth as the photo shows it. Ends with no
+vertex and no face centre inside the body.
 """
 
 from __future__ import annotations

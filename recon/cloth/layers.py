@@ -108,9 +108,7 @@ class LayeredCloth:
         for start, limits, level in zip(self.starts, self.limits, self.levels):
             for direction in (1.0, -1.0):
                 normal = np.tile([0.0, direction, 0.0], (len(level), 1))
-                yield Contacts(
-                    vertex=limits.held + start, point=level - self.settings.offset * normal, normal=normal
-                )
+                yield Contacts(vertex=limits.held + start, point=level - self.settings.offset * normal, normal=normal)
 
     def _over(self, parts: list[NDArray], k: int, j: int) -> Contacts:
         """Vertices of layer k near layer j beneath it: they stay outside of its faces."""

@@ -7,7 +7,7 @@ launch per constraint colour. Parallelism comes from one process a garment.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -246,7 +246,7 @@ class Carry:
 def carry(
     transport: NDArray,
     constraints: Constraints,
-    frames: Sequence[NDArray],
+    frames: NDArray,
     faces: NDArray,
     settings: Settings | None = None,
     how: Carry | None = None,
@@ -259,15 +259,18 @@ def carry(
     Args:
         transport: (T, V, 3) where skinning alone takes the garment [m]; its first frame is the start.
         constraints: the garment's; a waistband keeps the height that ``transport`` gives it.
-        frames: T arrays (B, 3) of what it collides with: the body and layers beneath [m].
+        frames: (T, B, 3) what it collides with: the body and layers beneath [m].
         faces: (F, 3) of those, outward.
     """
     s, how = settings or Settings(), how or Carry()
     mesh = body_mesh(frames[0], faces)
     state = _begin(transport[0], constraints, mesh, s)
     state.cloth.held_y.numpy()[:] = transport[0, constraints.held, 1]
-    still = {"gravity": 9.81, "damping": how.damping, "friction": s.friction, "search": 8, "limit": 1.5}
-    _run(state, how.first_steps, **still)
+
+    def relax(steps: int) -> None:
+        _run(state, steps, gravity=9.81, damping=how.damping, friction=s.friction, search=8, limit=1.5)
+
+    relax(how.first_steps)
     yield state.cloth.x.numpy().astype(np.float64)
     for k in range(1, len(frames)):
         mesh.points.numpy()[:] = frames[k]
@@ -275,7 +278,7 @@ def carry(
         state.cloth.x.numpy()[:] += (transport[k] - transport[k - 1]).astype(np.float32)
         state.cloth.held_y.numpy()[:] = transport[k, constraints.held, 1]
         last = k + 1 == len(frames)
-        _run(state, how.steps + (how.last_steps if last else 0), **still)
+        relax(how.steps + (how.last_steps if last else 0))
         yield state.cloth.x.numpy().astype(np.float64)
 
 

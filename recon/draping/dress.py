@@ -12,15 +12,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from recon.bodies import Body
 from recon.cloth.energies import Cloth
 from recon.cloth.xpbd import Carry, Constraints, Settings, carry
-from recon.draping.skinning import SkinningDraper
+from recon.draping import Draper
 from recon.garments import WAISTED
 from recon.garments.panels import waistband
-from recon.types import BodyPose, Garment, Mesh
+from recon.types import BodyPose, Garment, to_device
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ def dress(
     garments: Sequence[Garment],
     body: Body,
     pose: BodyPose,
-    skinning: SkinningDraper,
+    skinning: Draper,
     settings: Dressing | None = None,
     tick: Callable[[int, float], None] | None = None,
 ) -> list[NDArray]:
@@ -74,14 +73,14 @@ def dress(
         (V, 3) vertices of each garment, double precision [m].
     """
     s = settings or Dressing()
-    posed = body.pose(_way(pose, s.frames))
+    posed, device = body.pose(_way(pose, s.frames)), pose.pose.device
     frames, faces = posed.mesh.vertices.cpu().numpy(), body.faces.cpu().numpy()
     simulation = Settings(
         bend_compliance=s.bend_compliance, self_distance=s.self_distance, offset=s.offset, friction=s.friction
     )
     ends: list[NDArray] = []
     for garment in reversed(garments):
-        skinned = skinning.drape_vertices(garment.mesh, posed).double().cpu().numpy()
+        skinned = skinning.drape(to_device(garment, device), posed).vertices.double().cpu().numpy()
         own = []
         for k, x in enumerate(carry(skinned, limits_of(garment), frames, faces, simulation, Carry(steps=s.steps))):
             own.append(x)

@@ -79,12 +79,6 @@ def read_manifest(folder: str | Path | None = None) -> dict[str, dict[str, Any]]
     return cards
 
 
-def manifest_digest(folder: str | Path | None = None) -> str:
-    """A digest of which weights a folder holds: changes with any network's content; "" where there are none."""
-    held = {name: card.get("sha256") for name, card in read_manifest(folder).items()}
-    return hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest() if held else ""
-
-
 def write_weights(
     name: str, tensors: dict[str, Tensor], card: dict[str, Any], folder: str | Path, dtype: torch.dtype = torch.float16
 ) -> Path:

@@ -37,20 +37,18 @@ def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
     """
     points = garment.panel_points.detach().double().cpu()
     faces = garment.panel_faces.cpu()
-    mirrored = torch.where(garment.panel_of_face.cpu() == 1, -1.0, 1.0).double()
     low, high = points.min(0).values, points.max(0).values
     basis = _bernstein((points - low) / (high - low))
     sides = _sides(worn.detach().double().cpu()[garment.mesh.faces.cpu()])
     metric = sides.transpose(1, 2) @ sides
     areas = torch.linalg.det(_sides(points[faces])).abs() / 2
     sound = areas > 0.05 * areas.mean()  # slivers say more about the meshing than about the cloth
-    faces, metric, mirrored, weights = faces[sound], metric[sound], mirrored[sound], areas[sound] / areas[sound].sum()
+    faces, metric, weights = faces[sound], metric[sound], areas[sound] / areas[sound].sum()
 
     @torch.enable_grad()
     def energy(moves: np.ndarray) -> tuple[float, np.ndarray]:
         c = torch.from_numpy(moves).requires_grad_()
-        rest = _sides((points + basis @ c)[faces]) * mirrored[:, None, None]
-        inverse = torch.linalg.inv(rest)
+        inverse = torch.linalg.inv(_sides((points + basis @ c)[faces]))
         green = 0.5 * (inverse.transpose(1, 2) @ metric @ inverse - torch.eye(2, dtype=points.dtype))
         misfit = (weights * torch.log1p(green.square().sum((1, 2)) / OUTLIER**2)).sum()
         uneven = (c - c.mean(0)).square().sum() / float((high - low).max()) ** 2

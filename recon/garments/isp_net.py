@@ -156,7 +156,3 @@ class IspNets(nn.Module):
     def to_world(self, positions: Tensor) -> Tensor:
         """(..., 3) lifted positions in domain units -> rest space of the neutral body [m]."""
         return positions * self.shape.half + F.pad(positions.new_tensor(self.shape.centre), (0, 1))
-
-    def from_world(self, points: Tensor) -> Tensor:
-        """(..., 3) rest space [m] -> domain units."""
-        return (points - F.pad(points.new_tensor(self.shape.centre), (0, 1))) / self.shape.half

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from recon.types import Garment
-from scipy import ndimage
 
 SNAP = 0.25
 """Grid vertices closer to the border than this share of a cell's edge move onto it."""

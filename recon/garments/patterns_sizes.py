@@ -22,8 +22,8 @@ def top(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a tank, tshirt, shirt or jacket."""
     fit = rng.beta(1.1, 1.3)
     # Woven cloth tighter than this across the chest would have to stretch, most of all with long sleeves set in.
-    ease = {"tank": (0.022, 0.055), "tshirt": (0.028, 0.082), "shirt": (0.035, 0.090), "jacket": (0.038, 0.095)}
-    low, high = ease[variant]
+    eases = {"tank": (0.022, 0.055), "tshirt": (0.028, 0.082), "shirt": (0.035, 0.090), "jacket": (0.038, 0.095)}
+    low, high = eases[variant]
     p = _shoulders(variant, rng, m, fit, low + fit * (high - low))
     if variant == "jacket":
         p["opening"] = rng.uniform(0.050, 0.060)
