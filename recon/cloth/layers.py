@@ -17,10 +17,8 @@ from torch import Tensor
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
 from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings
-from recon.cloth.xpbd import Constraints, close_strangers
+from recon.cloth.xpbd import ON_BORDER, Constraints, close_strangers, open_rim
 
-ON_BORDER = 1e-3
-"""Corners of a face with less weight than this play no part in a closest point."""
 LAYER_REACH = 0.02
 """Layers further apart than this, or deeper in each other, don't touch [m]."""
 SAME_WAY = 0.5
@@ -51,7 +49,7 @@ class LayeredCloth:
         self.settings = settings or PolishSettings(apart=0.5)
         self.apart = [self.settings.apart * float(k.edge_lengths.mean()) for k in self.limits]
         self.faces = [c.faces for c in cloths]
-        self.rims = [_rim(c) for c in cloths]
+        self.rims = [open_rim(c.faces.numpy(), len(c.masses)) for c in cloths]
         self.starts = np.cumsum([0, *[len(c.masses) for c in cloths]])
         self.cloth = stack(cloths)
         self.energy = ElasticEnergy(self.cloth)
@@ -166,13 +164,3 @@ def _laplacian(cloth: Cloth) -> sp.csr_matrix:
     half = sp.coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(count, count))
     both = (half + half.T).tocsr()
     return sp.diags(np.asarray(both.sum(1)).ravel()) - both
-
-
-def _rim(cloth: Cloth) -> NDArray:
-    """(V,) whether a vertex lies on an open border: at an edge without a hinge."""
-    count = len(cloth.masses)
-    inner = cloth.hinges[:, :2].sort(1).values.numpy() @ [count, 1]
-    edges = cloth.edges.numpy()
-    rim = np.zeros(count, bool)
-    rim[edges[~np.isin(edges @ [count, 1], inner)]] = True
-    return rim

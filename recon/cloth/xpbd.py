@@ -23,6 +23,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 DEVICE = "cpu"
 CONTACT_REACH = 0.06
 """Body contact is searched for within this distance of a vertex [m]."""
+ON_BORDER = wp.constant(1e-3)
+"""Corners of a face with less weight than this play no part in a closest point."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +144,17 @@ class _Motion:
     friction: float
 
 
+@wp.func
+def _on_rim(mesh: wp.uint64, rim: wp.array(dtype=int), face: int, u: float, v: float):
+    weights = wp.vec3(u, v, 1.0 - u - v)
+    for k in range(3):
+        if weights[k] > ON_BORDER and rim[wp.mesh_get_index(mesh, 3 * face + k)] == 0:
+            return False
+    return True
+
+
 @wp.kernel
-def _search(mesh: wp.uint64, reach: float, cloth: _Cloth):
+def _search(mesh: wp.uint64, rim: wp.array(dtype=int), reach: float, cloth: _Cloth):
     i = wp.tid()
     x = cloth.x[i]
     hit = wp.mesh_query_point_sign_normal(mesh, x, reach)
@@ -153,7 +164,10 @@ def _search(mesh: wp.uint64, reach: float, cloth: _Cloth):
         normal = wp.mesh_eval_face_normal(mesh, hit.face)
         away = x - on
         if wp.length(away) > 1.0e-5:
-            normal = wp.normalize(away) * hit.sign
+            side = hit.sign
+            if _on_rim(mesh, rim, hit.face, hit.u, hit.v):
+                side = 1.0  # beside an open border there are no sides: keep away from it
+            normal = wp.normalize(away) * side
         cloth.plane_point[i] = on
         cloth.plane_normal[i] = normal
         cloth.touching[i] = 1.0
@@ -264,7 +278,7 @@ def carry(
     """
     s, how = settings or Settings(), how or Carry()
     mesh = body_mesh(frames[0], faces)
-    state = _begin(transport[0], constraints, mesh, s)
+    state = _begin(transport[0], constraints, mesh, s, open_rim(faces, frames.shape[1]))
     state.cloth.held_y.numpy()[:] = transport[0, constraints.held, 1]
 
     def relax(steps: int) -> None:
@@ -289,6 +303,7 @@ class _State:
     count: int
     constraints: Constraints
     body: wp.Mesh
+    rim: wp.array
     settings: Settings
 
 
@@ -299,7 +314,7 @@ def _run(state: _State, steps: int, *, gravity: float, damping: float, friction:
     done = 0
     while done < steps:
         now = min(search, steps - done)
-        wp.launch(_search, state.count, inputs=[state.body.id, CONTACT_REACH, state.cloth], device=DEVICE)
+        wp.launch(_search, state.count, inputs=[state.body.id, state.rim, CONTACT_REACH, state.cloth], device=DEVICE)
         nears = _search_self(state) if gravity > 0 else 0
         inputs = [state.cloth, motion, state.count, state.pairs, nears, now]
         wp.launch(_advance, 1, inputs=inputs, device=DEVICE)
@@ -315,6 +330,15 @@ def _search_self(state: _State) -> int:
         state.cloth.near.numpy()[: len(pairs)] = pairs
         state.cloth.near_length.numpy()[: len(pairs)] = distance
     return len(pairs)
+
+
+def open_rim(faces: NDArray, count: int) -> NDArray:
+    """(V,) whether each of ``count`` vertices lies on an open border of a mesh: at an edge of one face only."""
+    ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1).astype(np.int64)
+    keys, times = np.unique(ends @ [count, 1], return_counts=True)
+    rim = np.zeros(count, bool)
+    rim[np.concatenate(np.divmod(keys[times == 1], count))] = True
+    return rim
 
 
 def held_height(x: NDArray, held: NDArray) -> float:
@@ -333,9 +357,10 @@ def close_strangers(x: NDArray, rest: NDArray, distance: float) -> NDArray:
     return pairs[far]
 
 
-def _begin(start: NDArray, constraints: Constraints, body: wp.Mesh, s: Settings) -> _State:
+def _begin(start: NDArray, constraints: Constraints, body: wp.Mesh, s: Settings, rim: NDArray | None = None) -> _State:
     cloth, pairs = _allocate(start, constraints, s)
-    return _State(cloth, pairs, len(start), constraints, body, s)
+    open_ends = wp.array(np.zeros(len(body.points)) if rim is None else rim, dtype=int, device=DEVICE)
+    return _State(cloth, pairs, len(start), constraints, body, open_ends, s)
 
 
 def _allocate(start: NDArray, constraints: Constraints, s: Settings) -> tuple[_Cloth, int]:

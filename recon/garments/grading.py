@@ -7,6 +7,7 @@ polynomial of low degree: front and back move alike, so that seams that matched 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from math import comb
 
 import numpy as np
@@ -18,8 +19,9 @@ from recon.types import Garment
 
 DEGREE = 3
 """Degree of the map along each axis of the plane."""
-OUTLIER = 0.15
-"""Green strain beyond which a triangle pulls no harder."""
+OUTLIERS = ((1.0, 0.25), (0.15, 0.75))
+"""Green strain beyond which a triangle pulls no harder, and the share of iterations that are taken with it: first all
+triangles pull, else those that start as outliers (on a much larger body nearly all) would not say where to."""
 STIFFNESS = 1e-3
 """Weight of the map's own unevenness, against what the cloth does not need."""
 
@@ -46,17 +48,19 @@ def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
     faces, metric, weights = faces[sound], metric[sound], areas[sound] / areas[sound].sum()
 
     @torch.enable_grad()
-    def energy(moves: np.ndarray) -> tuple[float, np.ndarray]:
+    def energy(moves: np.ndarray, outlier: float) -> tuple[float, np.ndarray]:
         c = torch.from_numpy(moves).requires_grad_()
         inverse = torch.linalg.inv(_sides((points + basis @ c)[faces]))
         green = 0.5 * (inverse.transpose(1, 2) @ metric @ inverse - torch.eye(2, dtype=points.dtype))
-        misfit = (weights * torch.log1p(green.square().sum((1, 2)) / OUTLIER**2)).sum()
+        misfit = (weights * torch.log1p(green.square().sum((1, 2)) / outlier**2)).sum()
         uneven = (c - c.mean(0)).square().sum() / float((high - low).max()) ** 2
         loss = misfit + STIFFNESS * uneven
         (gradient,) = torch.autograd.grad(loss, c)
         return loss.item(), gradient.numpy()
 
-    moves = lbfgs(energy, np.zeros((basis.shape[1], 2)), iterations)
+    moves = np.zeros((basis.shape[1], 2))
+    for outlier, share in OUTLIERS:
+        moves = lbfgs(partial(energy, outlier=outlier), moves, round(share * iterations))
     graded = points + basis @ torch.from_numpy(moves)
     return replace(garment, panel_points=graded.to(garment.panel_points))
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from recon.garments.panels import border_loops, cut_panel, grid_axis, move_safely, signed_areas
+from recon.garments.dataset import load_garments
+from recon.garments.panels import border_loops, cut_panel, grid_axis, move_safely, signed_areas, waistband
 from recon.garments.sewing import (
     arc_lengths,
     chains_of,
@@ -185,3 +186,15 @@ def test_chains_pair_by_label_and_place():
     ends = front.points[[chains[0].points[0], chains[0].points[-1]]]
     np.testing.assert_allclose(np.abs(ends), [[0.5, 0.6]] * 2, atol=0.05)
     assert (labels[front.border] >= 0).all()
+
+
+@pytest.mark.parametrize("kind", ["trousers", "skirt"])
+def test_the_waistband_is_the_highest_border(kind):
+    for garment in load_garments(kind, "test")[:3]:
+        band = waistband(garment)
+        heights = garment.mesh.vertices[:, 1].numpy()
+        others = [loop for loop in border_loops(garment.mesh.faces.numpy()) if not set(loop) & set(band)]
+        assert len(others) == {"trousers": 2, "skirt": 1}[kind]  # hems
+        assert max(heights[loop].max() for loop in others) < heights[band].min() - 0.1
+        assert np.ptp(heights[band]) < 1e-3 and heights[band].max() == heights.max()
+        assert len(set(band)) == len(band)
