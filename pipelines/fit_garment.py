@@ -17,7 +17,7 @@ from recon.cloth.contact import BodyContact
 from recon.descend import Descent, descend
 from recon.draping import Draper
 from recon.garments import GarmentDecoder
-from recon.garments.latents import LatentPrior, nearest, of_variants, spread
+from recon.garments.latents import LatentPrior, Neighbourhood, nearest, of_variants, spread
 from recon.losses import chamfer_pull, depth_penalty, hard_iou, soft_iou_loss
 from recon.types import Camera, Garment, Photo, PosedBody, UserError
 
@@ -46,6 +46,8 @@ class GarmentFit:
     """Step size of the code in standard deviations of the learned codes."""
     mahalanobis: float = 0.01
     """Weight of the squared Mahalanobis distance from the mean of the codes that the name allows, per dimension."""
+    neighbourhood: float = 0.02
+    """Weight of the squared distance from the nearest learned codes, in units of the distance between those."""
     pull: float = 2.0
     """Weight of the distance-field pull, faded out as the overlap grows."""
     contact: float = 0.3
@@ -171,7 +173,8 @@ class GarmentLoss:
     ):
         self.outer, self.anchors, self.photo, self.models, self.settings = outer, anchors, photo, models, settings
         self.decoder = models.decoders[name]
-        self.prior = LatentPrior.of(self.decoder.codes[of_variants(self.decoder.variants, models.variants[name])])
+        allowed = self.decoder.codes[of_variants(self.decoder.variants, models.variants[name])]
+        self.prior, self.known = LatentPrior.of(allowed), Neighbourhood.of(allowed)
         self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
         self._shape: Garment | None = None
         self._cut_at, self._age = self.decoder.codes[0], 0
@@ -210,6 +213,7 @@ class GarmentLoss:
         )
         loss = loss + s.contact * depth_penalty(gap, s.clearance) / 10
         loss = loss + s.mahalanobis * self.prior.energy(values["latent"])
+        loss = loss + s.neighbourhood * self.known.energy(values["latent"])
         loss = loss + s.anchor * anchor_loss(values, self.anchors) / 10
         return loss + 0.1 * evidence_loss(values, posed, models.body, self.photo, BodyFit())
 

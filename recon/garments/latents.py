@@ -40,6 +40,29 @@ class LatentPrior:
         return self.mean + white.to(self.mean.device) @ self.factor.T
 
 
+@dataclass(frozen=True)
+class Neighbourhood:
+    """How far a code is from what was learned: between learned codes that are far apart, a decoder knows nothing."""
+
+    codes: Tensor
+    """(n, z) learned codes."""
+    scale: float
+    """Median distance of a learned code from its nearest neighbour."""
+
+    @staticmethod
+    def of(codes: Tensor) -> Neighbourhood:
+        """Of codes (n, z)."""
+        if len(codes) < 2:
+            return Neighbourhood(codes, float(codes.norm().clamp_min(1e-6)))
+        apart = torch.cdist(codes, codes).fill_diagonal_(float("inf")).min(1).values
+        return Neighbourhood(codes, float(apart.median().clamp_min(1e-6)))
+
+    def energy(self, z: Tensor) -> Tensor:
+        """Squared distance from the nearest learned codes (a soft minimum) in units of ``scale``: (z,) -> ()."""
+        square = (self.codes - z).square().sum(1) / self.scale**2
+        return -torch.logsumexp(-square, 0)
+
+
 def mahalanobis(latent: Tensor, codes: Tensor) -> Tensor:
     """Mean squared Mahalanobis distance per dimension of latents (..., z) from the learned codes (n, z): (...)."""
     return LatentPrior.of(codes).energy(latent)

@@ -18,6 +18,8 @@ from recon.garments.panels import Panel, border_edges, border_loops, cross, move
 
 SHORTEST_RUN = 0.025
 """Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
+SLIT_SHARE = 0.8
+"""An open run within one seam and shorter than this share of each of its two parts is a wrong label."""
 CORNER_REACH = 0.03
 """How far from a label change its corner is searched [domain units]."""
 MAX_CHAIN_DISTANCE = 0.15
@@ -68,6 +70,24 @@ def clean_runs(labels: NDArray, lengths: NDArray) -> NDArray:
         labels[index] = labels[starts[winner]]
 
 
+def without_slits(labels: NDArray, lengths: NDArray) -> NDArray:
+    """Labels along a closed loop in which no short open run lies within one seam: patterns have no such slits."""
+    labels = labels.copy()
+    total = np.concatenate([[0.0], np.cumsum(lengths)])
+    while True:
+        starts = np.nonzero(labels != np.roll(labels, 1))[0]
+        runs = labels[starts]
+        run = (total[np.roll(starts, -1)] - total[starts]) % total[-1]
+        beside = np.minimum(np.roll(run, 1), np.roll(run, -1))
+        short = (run < SLIT_SHARE * beside) & (beside > 4 * SHORTEST_RUN)
+        slits = np.nonzero((runs == 0) & (np.roll(runs, 1) == np.roll(runs, -1)) & short)[0]
+        if len(starts) < 3 or not len(slits):
+            return labels
+        first, last = starts[slits[0]], starts[(slits[0] + 1) % len(starts)]
+        index = np.arange(first, last + (len(labels) if last <= first else 0)) % len(labels)
+        labels[index] = labels[first - 1]
+
+
 def corner_near(points: NDArray, lengths: NDArray, change: int) -> int:
     """The loop vertex near a label change (first vertex of the new run) where the border turns most."""
     n = len(points)
@@ -99,7 +119,7 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
     for loop in panel.loops:
         place = panel.points[loop]
         lengths = np.linalg.norm(np.roll(place, -1, 0) - place, axis=1)
-        clean = clean_runs(labels[offset : offset + len(loop)], lengths)
+        clean = without_slits(clean_runs(labels[offset : offset + len(loop)], lengths), lengths)
         offset += len(loop)
         per_point[loop] = 0
         changes = np.nonzero(clean != np.roll(clean, 1))[0]

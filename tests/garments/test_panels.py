@@ -15,6 +15,7 @@ from recon.garments.sewing import (
     pair_chains,
     sew,
     split_chords,
+    without_slits,
 )
 
 
@@ -186,6 +187,18 @@ def test_chains_pair_by_label_and_place():
     ends = front.points[[chains[0].points[0], chains[0].points[-1]]]
     np.testing.assert_allclose(np.abs(ends), [[0.5, 0.6]] * 2, atol=0.05)
     assert (labels[front.border] >= 0).all()
+
+
+def test_a_slit_within_a_seam_is_sewn_and_openings_between_seams_stay() -> None:
+    labels = np.array([1] * 8 + [0] * 2 + [1] * 6 + [0] * 4 + [2] * 9 + [0] * 4)
+    whole = np.array([1] * 16 + [0] * 4 + [2] * 9 + [0] * 4)
+    even = np.ones(len(labels))
+    for shift in (0, -9, 5):  # also across the loop's start
+        assert without_slits(np.roll(labels, shift), even).tolist() == np.roll(whole, shift).tolist()
+    tube = np.array([1, 1, 1, 0, 0, 0])
+    assert without_slits(tube, np.ones(6)).tolist() == tube.tolist()
+    both_ways = np.array([1] * 4 + [0] * 4 + [1] * 4 + [0] * 4)  # a tube with one seam label on both sides
+    assert without_slits(both_ways, np.ones(16)).tolist() == both_ways.tolist()
 
 
 @pytest.mark.parametrize("kind", ["trousers", "skirt"])
