@@ -77,14 +77,13 @@ def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, roun
         if lack.max() <= 0:
             break
         move = lack[:, None] * F.normalize(normal, dim=1)
-        n = len(x)
-        of_faces = torch.zeros_like(x)
-        of_faces.index_reduce_(0, faces.reshape(-1), move[n:].repeat_interleave(3, 0), "amax", include_self=True)
-        low = torch.zeros_like(x).index_reduce_(
-            0, faces.reshape(-1), move[n:].repeat_interleave(3, 0), "amin", include_self=True
-        )
-        spread = torch.where(of_faces.abs() > low.abs(), of_faces, low)
-        x = x + torch.where(move[:n].abs() > spread.abs(), move[:n], spread) * 1.05
+        n, corners = len(x), faces.reshape(-1)
+        pushed = (lack[n:] > 0).to(x.dtype).repeat_interleave(3)
+        count = torch.zeros(n, dtype=x.dtype, device=x.device).index_add_(0, corners, pushed)
+        by_faces = torch.zeros_like(x).index_add_(0, corners, move[n:].repeat_interleave(3, 0))
+        by_faces = by_faces / count.clamp_min(1)[:, None]
+        own = (lack[:n] > by_faces.norm(dim=1))[:, None]
+        x = x + torch.where(own, move[:n], by_faces) * 1.05
     return x
 
 

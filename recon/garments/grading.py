@@ -1,7 +1,8 @@
 """Pattern grading: panels cut for the neutral body made to fit another body, seams still matching.
 
 Tailors grade a pattern by moving its points along smooth rules. Here the rule is one map of the panels' common plane, a
-polynomial of low degree: front and back move alike, so that seams that matched in length still do.
+polynomial of low degree. Along seams front and back move alike, so that what matched in length still does; away from
+them the front may grow where the back shrinks, by a second such map that fades out at the seams.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from math import comb
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.cloth.solve import lbfgs
@@ -24,6 +26,10 @@ OUTLIERS = ((1.0, 0.25), (0.15, 0.75))
 triangles pull, else those that start as outliers (on a much larger body nearly all) would not say where to."""
 STIFFNESS = 1e-3
 """Weight of the map's own unevenness, against what the cloth does not need."""
+
+
+SEAM_REACH = 0.08
+"""Width of the band along seams in which front and back move nearly alike [m]."""
 
 
 def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
@@ -40,7 +46,8 @@ def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
     points = garment.panel_points.detach().double().cpu()
     faces = garment.panel_faces.cpu()
     low, high = points.min(0).values, points.max(0).values
-    basis = _bernstein((points - low) / (high - low))
+    shared = _bernstein((points - low) / (high - low))
+    basis = torch.cat([shared, _between_panels(garment, points)[:, None] * shared], 1)
     sides = _sides(worn.detach().double().cpu()[garment.mesh.faces.cpu()])
     metric = sides.transpose(1, 2) @ sides
     areas = torch.linalg.det(_sides(points[faces])).abs() / 2
@@ -53,7 +60,8 @@ def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
         inverse = torch.linalg.inv(_sides((points + basis @ c)[faces]))
         green = 0.5 * (inverse.transpose(1, 2) @ metric @ inverse - torch.eye(2, dtype=points.dtype))
         misfit = (weights * torch.log1p(green.square().sum((1, 2)) / outlier**2)).sum()
-        uneven = (c - c.mean(0)).square().sum() / float((high - low).max()) ** 2
+        alike, apart = c.split(shared.shape[1])
+        uneven = torch.cat([alike - alike.mean(0), apart]).square().sum() / float((high - low).max()) ** 2
         loss = misfit + STIFFNESS * uneven
         (gradient,) = torch.autograd.grad(loss, c)
         return loss.item(), gradient.numpy()
@@ -63,6 +71,18 @@ def grade(garment: Garment, worn: Tensor, iterations: int = 60) -> Garment:
         moves = lbfgs(partial(energy, outlier=outlier), moves, round(share * iterations))
     graded = points + basis @ torch.from_numpy(moves)
     return replace(garment, panel_points=graded.to(garment.panel_points))
+
+
+def _between_panels(garment: Garment, points: Tensor) -> Tensor:
+    """(P,) 1 on the front panel and -1 on the back one, fading to 0 at seams."""
+    vertex = garment.vertex_of_point.cpu()
+    sewn = torch.bincount(vertex)[vertex] > 1
+    side = torch.ones(len(points), dtype=points.dtype)
+    side[garment.panel_faces[garment.panel_of_face == 1].cpu().flatten()] = -1.0
+    if not sewn.any():
+        return side
+    distance = torch.from_numpy(cKDTree(points[sewn].numpy()).query(points.numpy())[0])
+    return side * (1 - torch.exp(-((distance / SEAM_REACH) ** 2)))
 
 
 def _sides(corners: Tensor) -> Tensor:

@@ -50,6 +50,19 @@ def test_an_uneven_map_is_found() -> None:
     assert (strains(grade(PANELS, worn), worn) - 1).abs().max() < 0.01
 
 
+def test_the_front_may_grow_where_the_back_does_not() -> None:
+    """Longer in the middle of the front only: found there, while the seams of both panels keep one length."""
+    points, front = PANELS.panel_points, torch.zeros(len(PANELS.panel_points), dtype=torch.bool)
+    front[PANELS.panel_faces[PANELS.panel_of_face == 0].flatten()] = True
+    middle = torch.exp(-((points[:, 0] / 0.1) ** 2)) * front
+    longer = torch.stack([points[:, 0], points[:, 1] * (1 + 0.2 * middle)], 1)
+    worn = worn_flat(PANELS, points)
+    inner = torch.bincount(PANELS.vertex_of_point)[PANELS.vertex_of_point] == 1
+    worn[PANELS.vertex_of_point[inner], :2] = longer[inner]
+    before, after = strains(PANELS, worn)[1] - 1, strains(grade(PANELS, worn), worn)[1] - 1
+    assert after < 0.6 * before
+
+
 def test_what_fits_stays_as_it_is() -> None:
     graded = grade(PANELS, worn_flat(PANELS, PANELS.panel_points))
     assert (graded.panel_points - PANELS.panel_points).abs().max() < 1e-4
