@@ -2,7 +2,7 @@
 
 The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
 simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
-overlap, all layers at once. Halfway the panels are graded again, to the cloth as the photo shows it. Ends with no
+overlap, all layers at once. In between the panels are graded again, to the cloth as the photo shows it. Ends with no
 vertex and no face centre inside the body.
 """
 
@@ -36,11 +36,13 @@ class Refinement:
 
     dressing: Dressing = field(default_factory=Dressing)
     """How the garments are put on and carried into the pose."""
+    gradings: int = 2
+    """How often the panels are graded anew to the cloth as the photo shows it."""
     settle: int = 30
     """Minimisation steps of physics alone, at the start and after the panels were graded anew."""
-    rounds: int = 2
-    """Rounds of minimisation with the silhouettes before and after that; contacts are searched anew in each."""
-    steps: int = 25
+    rounds: int = 1
+    """Rounds of minimisation with the silhouettes after that; contacts are searched anew in each."""
+    steps: int = 30
     """Minimisation steps per round."""
     long_side: int = 288
     """Resolution of the silhouettes."""
@@ -162,17 +164,17 @@ def refine(
     at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
     camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
     evidence = Evidence(posed, faces, at, camera, models, settings.evidence)
-    for half in range(2):
+    for number in range(settings.gradings + 1):
+        if number:  # what is strained under the evidence was cut too short or too wide
+            garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, physics.split(x))]
         physics = cloth_of(garments, body, settings)
         physics.hold(x)
         physics.touch(x)
         x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
-        for number in range(settings.rounds):
+        for again in range(settings.rounds):
             physics.touch(x)
             x = lbfgs(_sum(physics, evidence), x, settings.steps, precondition=physics.preconditioner())
-            tick(half * settings.rounds + number, physics(x)[0])
-        if half == 0:  # what is still strained now was cut too short or too wide
-            garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, physics.split(x))]
+            tick(number * settings.rounds + again, physics(x)[0])
     layers = [replace(layer, garment=g) for layer, g in zip(layers, garments)]
     contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
     meshes = {}
