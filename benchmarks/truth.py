@@ -48,7 +48,7 @@ def random_body(models: Models, generator: torch.Generator) -> BodyPose:
 
 
 def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
-    """Dress the body in test garments by simulation, render their masks, and note the body's own landmarks with 1 % noise."""
+    """Dress the body by simulation, render the masks, and note the body's own landmarks with 1 % noise."""
     generator = torch.Generator().manual_seed(1000 + number)
     place = random_body(models, generator)
     camera = Camera(

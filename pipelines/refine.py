@@ -123,13 +123,30 @@ def cloth_of(garments: list[Garment], body: BodyContact, settings: Refinement) -
     return LayeredCloth(cloths, [limits_of(g) for g in garments], body, contacts)
 
 
-def _sum(physics: LayeredCloth, evidence: Evidence) -> Callable[[NDArray], tuple[float, NDArray]]:
+def match(
+    parts: list[NDArray],
+    garments: list[Garment],
+    body: BodyContact,
+    evidence: Evidence,
+    settings: Refinement,
+    tick: Callable[[int, float], None],
+) -> list[NDArray]:
+    """Minimise physics alone, then physics and evidence together, from the vertices (V, 3) of each layer."""
+    physics, x = cloth_of(garments, body, settings), np.concatenate(parts)
+
     def total(x: NDArray) -> tuple[float, NDArray]:
         value, gradient = physics(x)
         more, pull = evidence(physics.split(x))
         return value + more, gradient + pull
 
-    return total
+    physics.hold(x)
+    physics.touch(x)
+    x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
+    for number in range(settings.rounds):
+        physics.touch(x)
+        x = lbfgs(total, x, settings.steps, precondition=physics.preconditioner())
+        tick(number, physics(x)[0])
+    return physics.split(x)
 
 
 def refine(
@@ -158,27 +175,20 @@ def refine(
         posed = models.body.pose(to_body(values))
         layers = graded(layers, values, models)
     garments = [layer.garment for layer in layers]
-    x = np.concatenate(dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick))
+    parts = dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick)
     device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
     body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
     at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
     camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
     evidence = Evidence(posed, faces, at, camera, models, settings.evidence)
-    for number in range(settings.gradings + 1):
-        if number:  # what is strained under the evidence was cut too short or too wide
-            garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, physics.split(x))]
-        physics = cloth_of(garments, body, settings)
-        physics.hold(x)
-        physics.touch(x)
-        x = lbfgs(physics, x, settings.settle, precondition=physics.preconditioner())
-        for again in range(settings.rounds):
-            physics.touch(x)
-            x = lbfgs(_sum(physics, evidence), x, settings.steps, precondition=physics.preconditioner())
-            tick(number * settings.rounds + again, physics(x)[0])
+    parts = match(parts, garments, body, evidence, settings, tick)
+    for _ in range(settings.gradings):  # what is strained under the evidence was cut too short or too wide
+        garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, parts)]
+        parts = match(parts, garments, body, evidence, settings, tick)
     layers = [replace(layer, garment=g) for layer, g in zip(layers, garments)]
     contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
     meshes = {}
-    for layer, part, f in zip(layers, physics.split(x), faces):
+    for layer, part, f in zip(layers, parts, faces):
         free = torch.from_numpy(part).to(device, torch.float32)
         meshes[layer.name] = Mesh(push_out(free, f, contact, settings.margin), f)
     return Refined([to_device(layer, device) for layer in layers], meshes)
