@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -106,7 +107,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     """Landmarks, limb directions and priors: what holds in every stage that moves body or camera."""
     camera = to_camera(values, (photo.rgb.shape[0], photo.rgb.shape[1]))
     points = body.landmarks(posed)[0]
-    trust = TRUST * photo.landmarks[:, 2]
+    trust = TRUST.to(photo.landmarks) * photo.landmarks[:, 2]
     height = person_height(photo)
     close = robust_distance(camera.project(points), photo.landmarks[:, :2], trust, settings.landmark_scale * height)
     a, b = (torch.tensor(side) for side in zip(*BONES))
@@ -115,7 +116,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     sure = torch.minimum(trust[a], trust[b])
     aligned = 1 - torch.cosine_similarity(ours, theirs, dim=-1)
     bones = (sure * aligned).sum() / sure.sum().clamp_min(1e-6)
-    expected = torch.log(torch.tensor(settings.focal * max(photo.rgb.shape[:2])))
+    expected = math.log(settings.focal * max(photo.rgb.shape[:2]))
     lens = ((values["log_focal"] - expected) / settings.focal_spread).square().sum()
     return (
         settings.landmarks * close
@@ -132,17 +133,17 @@ def start_values(body, photo: Photo, settings: BodyFit) -> dict[str, Tensor]:
     from recon.bodies.poses import a_pose
 
     size = (photo.rgb.shape[0], photo.rgb.shape[1])
-    pose = a_pose(1, 60.0).to(torch.float32)
     world = photo.landmarks_world
+    pose = a_pose(1, 60.0).to(world)
     across = (world[11] - world[12]) + (world[23] - world[24])
-    pose[0, 0] = torch.tensor([0.0, float(torch.atan2(-across[2], across[0])), 0.0])
+    pose[0, 0] = world.new_tensor([0.0, float(torch.atan2(-across[2], across[0])), 0.0])
     focal = settings.focal * max(size)
     values = {
-        "shape": torch.zeros(1, body.n_shape),
+        "shape": world.new_zeros(1, body.n_shape),
         "pose": pose,
-        "translation": torch.zeros(1, 3),
-        "log_focal": torch.tensor(focal).log(),
-        "pitch": torch.zeros(()),
+        "translation": world.new_zeros(1, 3),
+        "log_focal": world.new_tensor(math.log(focal)),
+        "pitch": world.new_zeros(()),
     }
     with torch.no_grad():
         points = body.landmarks(body.pose(to_body(values)))[0]
@@ -152,7 +153,7 @@ def start_values(body, photo: Photo, settings: BodyFit) -> dict[str, Tensor]:
         sure[[11, 12, 23, 24]] = True
     p, q = points[sure], photo.landmarks[sure, :2]
     depth = focal * spread(p[:, :2]) / spread(q).clamp_min(1.0)
-    centre = torch.tensor([size[1] / 2, size[0] / 2])
+    centre = world.new_tensor([size[1] / 2, size[0] / 2])
     at = (q.mean(0) - centre) / focal * depth
     values["translation"] = torch.stack([at[0], -at[1], -depth])[None] - torch.cat([p.mean(0)[:2], p.mean(0)[2:]])[None]
     return values

@@ -144,7 +144,7 @@ def _silhouette_score(
         garment = decoder.decode(decoder.codes[index], settings.retrieval_resolution)
         pixels = camera.project(models.draper.drape(garment, posed).vertices[0])
         drawn = silhouette(pixels.cpu().numpy(), garment.mesh.faces.cpu().numpy(), at.size)
-        return float(hard_iou(drawn[None].float(), at.targets[mine][None], weight)[0])
+        return float(hard_iou(drawn[None].to(at.targets), at.targets[mine][None], weight)[0])
 
     return score
 
@@ -205,7 +205,7 @@ class GarmentLoss:
         layers = [(models.draper.drape(o.garment, posed).vertices[0], o.garment.mesh.faces) for o in self.outer]
         image = scene_images(posed, [*layers, (mine, garment.mesh.faces)], camera, self.at.size, models)
         overlap = soft_iou_loss(image, self.at.targets, self.at.weight)
-        weights = torch.tensor([s.outer] * len(self.outer) + [1.0])
+        weights = overlap.new_tensor([s.outer] * len(self.outer) + [1.0])
         gap = BodyContact(posed.mesh.vertices[0], models.body.faces).signed_distance(mine)
         loss = (weights * overlap).sum()
         loss = loss + s.pull * overlap[-1].detach() ** 2 * chamfer_pull(

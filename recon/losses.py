@@ -35,9 +35,10 @@ def hard_iou(image: Tensor, target: Tensor, weight: Tensor | None = None) -> Ten
 def outside_distance(mask: Tensor) -> Tensor:
     """(h, w) bool mask -> (h, w) float distance to the mask in units of the image's height, 0 inside."""
     if not mask.any():
-        return torch.zeros(mask.shape)
+        return torch.zeros(mask.shape, device=mask.device)
     free = (~mask).to(torch.uint8).cpu().numpy()
-    return torch.from_numpy(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)) / mask.shape[0]
+    distance = torch.from_numpy(cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+    return distance.to(mask.device) / mask.shape[0]
 
 
 def sample_field(field: Tensor, pixels: Tensor) -> Tensor:
