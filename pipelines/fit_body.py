@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pipelines.evidence import Level, level
 from recon.bodies.pose_prior import pose_prior
+from recon.bodies.rig import JOINT_NAMES
 from recon.descend import Descended, Descent, descend
 from recon.losses import robust_distance
 from recon.types import BodyPose, Camera, Photo, PosedBody
@@ -30,6 +31,7 @@ BONES = (
     (12, 24),
 )
 """Pairs of BlazePose landmarks whose directions in space are compared with the network's guess."""
+KNEES = [JOINT_NAMES.index("l_knee"), JOINT_NAMES.index("r_knee")]
 TRUST = torch.tensor(
     [1.0] + [0.3] * 6 + [0.7] * 2 + [0.3] * 2 + [1.0] * 4 + [0.8] * 2 + [0.2] * 6 + [1.0] * 6 + [0.4] * 4
 )
@@ -52,9 +54,12 @@ class BodyFit:
     """Weight of limb directions in space against the landmark network's guess."""
     prior: float = 0.15
     """Weight of the pose prior (limits and Mahalanobis distance)."""
-    upright: float = 0.1
+    upright: float = 0.2
     """Weight of the body's lean out of the vertical (unit: 0.1 rad) and of the camera's pitch (unit: 0.3 rad): people
     stand upright before a tilted camera rather than lean before a level one."""
+    straight: float = 0.1
+    """Weight of bent knees (unit: 0.3 rad): a photo from the front hardly shows them, and people stand on straight legs
+    before they crouch."""
     shape: float = 0.06
     """Weight of the squared shape coefficients."""
     inside: float = 6.0
@@ -92,9 +97,13 @@ def to_camera(values: dict[str, Tensor], size: tuple[int, int]) -> Camera:
 
 
 def lean(posed: PosedBody) -> Tensor:
-    """() squared sine of the angle between the body's axis (between the ankles to the neck) and the vertical."""
-    axis = posed.joints[0, 12] - (posed.joints[0, 7] + posed.joints[0, 8]) / 2
-    return 1 - torch.nn.functional.normalize(axis, dim=0)[1].square()
+    """() squared sines of the angles of legs (ankles to pelvis) and trunk (pelvis to neck) with the vertical, summed.
+
+    Each for itself: a body whose legs lean forward and whose trunk leans back is not upright.
+    """
+    ankles, pelvis, neck = (posed.joints[0, list(k)] for k in ((7, 8), (0,), (12,)))
+    axes = torch.stack([pelvis.mean(0) - ankles.mean(0), neck.mean(0) - pelvis.mean(0)])
+    return (1 - torch.nn.functional.normalize(axes, dim=1)[:, 1].square()).sum()
 
 
 def person_height(photo: Photo) -> float:
@@ -122,6 +131,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
         settings.landmarks * close
         + settings.bones * bones
         + settings.prior * pose_prior(values["pose"]).mean()
+        + settings.straight * (values["pose"][:, KNEES, 0] / 0.3).square().mean()
         + settings.shape * values["shape"].square().mean()
         + settings.upright * (lean(posed) / 0.1**2 + values["pitch"].square() / 0.3**2)
         + 0.05 * lens

@@ -53,6 +53,7 @@ def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     style = rng.choice(["tank", "tshirt", "shirt"], p=[0.4, 0.35, 0.25])
     least = {"tank": 0.026, "tshirt": 0.030, "shirt": 0.036}[style]
     p = _shoulders(style, rng, m, fit, least + 0.046 * fit)
+    p["armpit_y"] -= 0.007  # the waist holds a dress: its armholes must leave more room than those of a top
     p["hem_y"] = _pick(
         rng,
         [
