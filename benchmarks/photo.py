@@ -154,9 +154,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "benchmark")
     parser.add_argument("--cases", type=int, default=10, help="outfits of known truth")
     args = parser.parse_args()
-    store = ROOT / "docs" / "results" / "photo.json"
-    found = json.loads(store.read_text()) if store.exists() else {"photos": {}}
-    found |= {
+    about = {
         "machine": platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "date": time.strftime("%Y-%m-%d"),
@@ -165,16 +163,25 @@ def main() -> None:
         if name == "truth":
             from truth import run_truth
 
-            found["truth"] = run_truth(args.cases, args.out)
+            new = {"truth": run_truth(args.cases, args.out)}
         elif not JOBS[name].photo.exists():
             print(f"{name}: {JOBS[name].photo.name} is not here, skipped")
             continue
         else:
-            found["photos"][name] = run_photo(name, JOBS[name], args.out)
+            new = {"photos": {name: run_photo(name, JOBS[name], args.out)}}
             keep_picture(name, args.out)
-        store.write_text(json.dumps(found, indent=1) + "\n")
-        write_page(found)
-    print(json.dumps(found["photos"] | {"truth": found.get("truth")}))
+        print(json.dumps(new))
+        keep(about | new)
+
+
+def keep(new: dict) -> None:
+    """Add to docs/results/photo.json, whatever else was measured meanwhile, and write the page."""
+    store = ROOT / "docs" / "results" / "photo.json"
+    found = json.loads(store.read_text()) if store.exists() else {}
+    photos = found.get("photos", {}) | new.get("photos", {})
+    found = found | new | {"photos": {name: photos[name] for name in JOBS if name in photos}}
+    store.write_text(json.dumps(found, indent=1) + "\n")
+    write_page(found)
 
 
 if __name__ == "__main__":
