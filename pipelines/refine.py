@@ -68,7 +68,7 @@ class Refined:
     """Name -> posed mesh (V, 3), faces as in the layer's garment."""
 
 
-def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, rounds: int = 60) -> Tensor:
+def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, rounds: int = 400) -> Tensor:
     """Move vertices along the distance's gradient until no vertex and no face centre is nearer than ``margin``."""
     x = x.detach().clone()
     for _ in range(rounds):
