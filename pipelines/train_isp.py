@@ -103,13 +103,13 @@ def train_isp(config: TrainIsp) -> Path:
     if not garments:
         raise UserError(f"{config.data or config.kind}: no garments of kind {config.kind} to train on")
     decoder, done = learn(garments, config, [item.parameters for item in items])
-    metrics: dict[str, dict[str, float]] = {}
-    if config.evaluate:
-        from pipelines.eval_isp import evaluate
+    path = store(decoder, config, done, {})  # evaluation takes minutes: what was learned is safe from now on
+    if not config.evaluate:
+        return path
+    from pipelines.eval_isp import evaluate
 
-        unseen = [item.garment for item in _items(config, "test")[: config.evaluate]]
-        metrics = evaluate(decoder, garments[: config.evaluate], unseen)
-    return store(decoder, config, done, metrics)
+    unseen = [item.garment for item in _items(config, "test")[: config.evaluate]]
+    return store(decoder, config, done, evaluate(decoder, garments[: config.evaluate], unseen))
 
 
 def _items(config: TrainIsp, split: str) -> list[Item]:
