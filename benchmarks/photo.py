@@ -163,15 +163,16 @@ def main() -> None:
         if name == "truth":
             from truth import run_truth
 
-            new = {"truth": run_truth(args.cases, args.out)}
+            for figures in run_truth(args.cases, args.out):
+                keep(about | {"truth": figures})
         elif not JOBS[name].photo.exists():
             print(f"{name}: {JOBS[name].photo.name} is not here, skipped")
             continue
         else:
             new = {"photos": {name: run_photo(name, JOBS[name], args.out)}}
             keep_picture(name, args.out)
-        print(json.dumps(new))
-        keep(about | new)
+            print(json.dumps(new))
+            keep(about | new)
 
 
 def keep(new: dict) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
@@ -89,8 +90,11 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
     return Truth(photo, meshes, posed.joints[0, 0])
 
 
-def run_truth(cases: int, out: Path) -> dict:
-    """Fit every case; per kind IoU and symmetric point-to-surface distance, the pelvis moved onto the true one."""
+def run_truth(cases: int, out: Path) -> Iterator[dict]:
+    """Fit every case; per kind IoU and symmetric point-to-surface distance, the pelvis moved onto the true one.
+
+    Yields the figures so far after every case.
+    """
     import shutil
 
     names = tuple(dict.fromkeys(n for outfit in OUTFITS for n in outfit))
@@ -112,9 +116,14 @@ def run_truth(cases: int, out: Path) -> dict:
             distance = compare_meshes(moved, truth.meshes[name], torch.Generator().manual_seed(0))["surface_mm"]
             rows.append({"case": number, "garment": name, "iou": iou[name], "chamfer_mm": float(distance)})
             print(rows[-1], flush=True)
-    kinds = {}
-    for name in names:
-        mine = [r for r in rows if r["garment"] == name]
-        kinds[name] = {k: median(r[k] for r in mine) for k in ("iou", "chamfer_mm")} | {"cases": len(mine)}
-    kinds["all"] = {k: median(r[k] for r in rows) for k in ("iou", "chamfer_mm")} | {"cases": len(rows)}
-    return {"rows": rows, "kinds": kinds}
+        yield {"rows": rows, "kinds": summary(rows)}
+
+
+def summary(rows: list[dict]) -> dict[str, dict]:
+    """Medians per garment name, and of all."""
+    groups = {name: [r for r in rows if r["garment"] == name] for name in dict.fromkeys(r["garment"] for r in rows)}
+    groups["all"] = rows
+    return {
+        name: {k: median(r[k] for r in mine) for k in ("iou", "chamfer_mm")} | {"cases": len(mine)}
+        for name, mine in groups.items()
+    }

@@ -50,7 +50,7 @@ class BodyFit:
     """Weight of the landmarks' robust distance."""
     landmark_scale: float = 0.03
     """Distance at which a landmark stops pulling harder, in units of the person's height in the photo."""
-    bones: float = 0.4
+    bones: float = 6.0
     """Weight of limb directions in space against the landmark network's guess."""
     prior: float = 0.15
     """Weight of the pose prior (limits and Mahalanobis distance)."""
