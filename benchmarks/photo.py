@@ -5,8 +5,8 @@
 
 Each photo runs as a user would run it (``recon photo`` in a process of its own), so that its peak memory and time are
 its own. Outfits of known truth are test garments that no decoder has seen, graded to unseen bodies, carried into
-unseen poses by simulation and rendered to masks; landmarks are the body's own points with 1 % noise. Perception is not
-part of those.
+unseen poses by simulation and rendered to masks; landmarks are the body's own points with 1 % noise in the picture
+and none in space, and weigh as such (``TRUSTED``). Perception is not part of those.
 """
 
 from __future__ import annotations

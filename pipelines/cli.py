@@ -53,6 +53,7 @@ COMMANDS = {
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
+    "train gaps": Command("learn to drape a garment in motion", "pipelines.train_gaps", "TrainGaps", "train_gaps"),
     "doctor": Command("say whether everything is in place", "pipelines.doctor", "", "main"),
 }
 

@@ -52,6 +52,9 @@ class BodyFit:
     """Distance at which a landmark stops pulling harder, in units of the person's height in the photo."""
     bones: float = 6.0
     """Weight of limb directions in space against the landmark network's guess."""
+    size: float = 0.5
+    """Weight of the body's size (unit: 5 %) against the landmark network's guess in metres: one view alone hardly tells
+    a tall person far away from a short one close by."""
     prior: float = 0.15
     """Weight of the pose prior (limits and Mahalanobis distance)."""
     upright: float = 0.2
@@ -125,11 +128,14 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     sure = torch.minimum(trust[a], trust[b])
     aligned = 1 - torch.cosine_similarity(ours, theirs, dim=-1)
     bones = (sure * aligned).sum() / sure.sum().clamp_min(1e-6)
+    lengths = [(sure * bone.norm(dim=-1)).sum().clamp_min(1e-6) for bone in (ours, theirs)]
+    size = ((lengths[0] / lengths[1]).log() / 0.05).square()
     expected = math.log(settings.focal * max(photo.rgb.shape[:2]))
     lens = ((values["log_focal"] - expected) / settings.focal_spread).square().sum()
     return (
         settings.landmarks * close
         + settings.bones * bones
+        + settings.size * size
         + settings.prior * pose_prior(values["pose"]).mean()
         + settings.straight * (values["pose"][:, KNEES, 0] / 0.3).square().mean()
         + settings.shape * values["shape"].square().mean()

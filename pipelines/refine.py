@@ -69,13 +69,17 @@ class Refined:
 
 
 def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, rounds: int = 400) -> Tensor:
-    """Move vertices along the distance's gradient until no vertex and no face centre is nearer than ``margin``."""
+    """Move vertices along the distance's gradient until no vertex and no face centre is nearer than ``margin``.
+
+    Where the body closes in from both sides there may be no such place: then the margin shrinks and steps grow.
+    """
     x = x.detach().clone()
-    for _ in range(rounds):
+    for k in range(rounds):
+        late = max(0.0, (2 * k - rounds) / rounds)
         points = torch.cat([x, x[faces].mean(1)]).requires_grad_()
         distance = contact.signed_distance(points)
         (normal,) = torch.autograd.grad(distance.sum(), points)
-        lack = F.relu(margin - distance.detach())
+        lack = F.relu(margin * (1 - 0.98 * late) - distance.detach())
         if lack.max() <= 0:
             break
         move = lack[:, None] * F.normalize(normal, dim=1)
@@ -85,7 +89,7 @@ def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, roun
         by_faces = torch.zeros_like(x).index_add_(0, corners, move[n:].repeat_interleave(3, 0))
         by_faces = by_faces / count.clamp_min(1)[:, None]
         own = (lack[:n] > by_faces.norm(dim=1))[:, None]
-        x = x + torch.where(own, move[:n], by_faces) * 1.05
+        x = x + torch.where(own, move[:n], by_faces) * (1.05 + 4 * late)
     return x
 
 

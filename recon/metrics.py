@@ -161,3 +161,33 @@ def _raster(garment: Garment, panel: int, low: NDArray, cell: float, shape: list
     for triangle in fixed:
         cv2.fillConvexPoly(image, triangle, 1, shift=8)
     return image > 0
+
+
+def drape_errors(template: Mesh, x: Tensor, inside: Tensor) -> dict[str, float]:
+    """GAPS' figures of a motion (§5), in percent.
+
+    Args:
+        template: the garment at rest, vertices (V, 3).
+        x: (F, V, 3) the draped frames.
+        inside: (F, V) bool, which vertices are in the body.
+
+    Returns:
+        ``eps_e``, ``eps_a``: mean absolute change of edge lengths and of triangle areas against the template;
+        ``eps_c``: share of vertices in the body, ``eps_c_std`` its deviation over the frames.
+    """
+    ends = torch.cat([template.faces[:, [0, 1]], template.faces[:, [1, 2]], template.faces[:, [2, 0]]])
+    ends = ends.sort(1).values.unique(dim=0)
+
+    def lengths(points: Tensor) -> Tensor:
+        return (points[..., ends[:, 0], :] - points[..., ends[:, 1], :]).norm(dim=-1)
+
+    def areas(points: Tensor) -> Tensor:
+        a, b, c = points[..., template.faces, :].unbind(-2)
+        return torch.linalg.cross(b - a, c - a).norm(dim=-1) / 2
+
+    errors = {}
+    for name, measure in (("eps_e", lengths), ("eps_a", areas)):
+        rest = measure(template.vertices.detach()).clamp_min(1e-12)
+        errors[name] = 100 * float(((measure(x) - rest).abs() / rest).mean())
+    share = 100 * inside.float().mean(1)
+    return errors | {"eps_c": float(share.mean()), "eps_c_std": float(share.std(unbiased=False))}

@@ -44,6 +44,24 @@ class BodyPose:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """A moving person, whatever their shape."""
+
+    pose: Tensor
+    """(F, 24, 3) local axis-angle of each frame [rad], as in ``BodyPose``."""
+    translation: Tensor
+    """(F, 3) [m], as in ``BodyPose``."""
+    fps: float
+    """Frames per second."""
+    notes: tuple[str, ...] = ()
+    """What a user should know (bad frames interpolated ...), one line each."""
+
+    def body(self, shape: Tensor) -> BodyPose:
+        """All frames as bodies of one shape (1, S)."""
+        return BodyPose(shape.expand(len(self.pose), -1), self.pose.to(shape), self.translation.to(shape))
+
+
+@dataclass(frozen=True)
 class PosedBody:
     """A body answering to the 24-joint rig, posed."""
 

@@ -7,12 +7,12 @@ everywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from recon.types import Garment
+from recon.types import Garment, Mesh
 
 GRAVITY = 9.81
 """[m/s²], along -y."""
@@ -60,15 +60,33 @@ class Cloth:
     """(H,) l² / (4 (a0 + a1))."""
     masses: Tensor
     """(V,) lumped masses [kg]."""
+    rest_angles: Tensor
+    """(H,) dihedral angles at which hinges are at rest; 0 = flat, as cloth off the bolt is [rad]."""
     fabric: Fabric
 
     @classmethod
     def from_garment(cls, garment: Garment, fabric: Fabric | None = None) -> Cloth:
         """Rest state from the panel points: each triangle lies flat and unstretched in its panel."""
-        fabric = fabric or Fabric()
-        faces = garment.mesh.faces
         flat = garment.panel_points.detach()[garment.panel_faces]  # (F, 3, 2)
         flat = torch.where((garment.panel_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
+        return cls.from_triangles(garment.mesh.faces, flat, garment.mesh.vertices.shape[-2], fabric)
+
+    @classmethod
+    def from_mesh(cls, mesh: Mesh, fabric: Fabric | None = None) -> Cloth:
+        """Rest state from a mesh without panels (V, 3): its triangles are unstretched as they are."""
+        a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
+        along, other = b - a, c - a
+        length = along.norm(dim=1).clamp_min(1e-12)
+        x = (along * other).sum(1) / length
+        y = (other.square().sum(1) - x.square()).clamp_min(0).sqrt()
+        zero = torch.zeros_like(length)
+        flat = torch.stack([torch.stack(p, 1) for p in ((zero, zero), (length, zero), (x, y))], 1)
+        return cls.from_triangles(mesh.faces, flat, len(mesh.vertices), fabric)
+
+    @classmethod
+    def from_triangles(cls, faces: Tensor, flat: Tensor, vertices: int, fabric: Fabric | None = None) -> Cloth:
+        """Rest state from flat triangles: faces (F, 3), their corners at rest (F, 3, 2) [m]."""
+        fabric = fabric or Fabric()
         rest = torch.stack([flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]], -1)
         doubled = torch.linalg.det(rest).abs()
         sound = doubled > 1e-10
@@ -77,10 +95,11 @@ class Cloth:
         areas = torch.where(sound, doubled / 2, 0.0)
         edges, edge_lengths = _edges(faces, flat)
         hinges, hinge_weights = _hinges(faces, areas, edges, edge_lengths)
-        masses = areas.new_zeros(garment.mesh.vertices.shape[-2])
+        masses = areas.new_zeros(vertices)
         share = areas * (fabric.density * fabric.thickness / 3)
         masses = masses.index_add(0, faces.reshape(-1), share.repeat_interleave(3))
-        return cls(faces, inverse, areas, edges, edge_lengths, hinges, hinge_weights, masses, fabric)
+        rest_angles = torch.zeros_like(hinge_weights)
+        return cls(faces, inverse, areas, edges, edge_lengths, hinges, hinge_weights, masses, rest_angles, fabric)
 
 
 def _edges(faces: Tensor, flat: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,8 +175,31 @@ def bend_angles(cloth: Cloth, x: Tensor) -> Tensor:
 
 
 def bending(cloth: Cloth, x: Tensor) -> Tensor:
-    """Bending energy (...,) [J]: stiffness · Σ l² / (4 (a0 + a1)) · θ²."""
-    return cloth.fabric.bending * (cloth.hinge_weights * bend_angles(cloth, x) ** 2).sum(-1)
+    """Bending energy (...,) [J]: stiffness · Σ l² / (4 (a0 + a1)) · (θ - θ_rest)²."""
+    return cloth.fabric.bending * (cloth.hinge_weights * (bend_angles(cloth, x) - cloth.rest_angles) ** 2).sum(-1)
+
+
+def towards_template(cloth: Cloth, template: Tensor, balance: Tensor) -> Cloth:
+    """The cloth with GAPS' bending (Eq. 12): flat where ``balance`` (H,) is 0, as in the template (V, 3) where it is 1.
+
+    balance (θ - θ_r)² + (1 - balance) θ² is (θ - balance θ_r)² but for a constant: a rest angle says it all.
+    """
+    return replace(cloth, rest_angles=balance * bend_angles(cloth, template).detach())
+
+
+def inertia(cloth: Cloth, x: Tensor, before: Tensor, earlier: Tensor, step: float) -> Tensor:
+    """GAPS Eq. 13 (...,) [J]: what leaving the path of ``earlier`` and ``before`` costs at ``x``; all (..., V, 3) [m].
+
+    ``step``: time between them [s]. No gradient flows to the earlier frames.
+    """
+    before, earlier = before.detach(), earlier.detach()
+    off = x - before - (before - earlier)
+    return (cloth.masses[:, None] * off.square()).sum((-1, -2)) / (2 * step**2)
+
+
+def collision(depth: Tensor, stiffness: float) -> Tensor:
+    """GAPS Eq. 11 (...,) [J]: ``depth`` (..., V) lack of distance from the body, max(eps - d, 0) [m]."""
+    return stiffness * depth.pow(3).sum(-1)
 
 
 def gravity(cloth: Cloth, x: Tensor) -> Tensor:

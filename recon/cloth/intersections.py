@@ -1,77 +1,131 @@
-"""Exact self-intersections of a triangle mesh: a broad phase by boxes, then triangle against triangle in float64.
+"""Where edges pass through faces: the exact test behind self-intersections and untangling, compiled.
 
-Two triangles intersect if an edge of one passes through the other. Triangles that share one vertex are tested by the
-edges opposite of it, those that share an edge can only overlap by folding flat onto each other, which has no volume
-and is not counted (the exact test of a shared edge is a matter of one plane).
+A box hierarchy (Warp) proposes, signs of tetrahedron volumes in doubles decide: no division, so no tolerance. Edges
+that share a vertex with a face are not tested against it.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
+
+wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
+wp.set_module_options({"enable_backward": False})
+
+DEVICE = "cpu"
+GROW = 1.0e-6
+"""Boxes are grown by this share of their coordinates: they are single precision, the test is not."""
+
+
+@wp.func
+def _volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
+    return wp.dot(wp.cross(b - a, c - a), d - a)
+
+
+@wp.func
+def _through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
+    zero = wp.float64(0.0)
+    above = _volume(a, b, c, p)
+    below = _volume(a, b, c, q)
+    if (above > zero and below > zero) or (above < zero and below < zero) or (above == zero and below == zero):
+        return False
+    u = _volume(p, q, a, b)
+    v = _volume(p, q, b, c)
+    w = _volume(p, q, c, a)
+    return (u >= zero and v >= zero and w >= zero) or (u <= zero and v <= zero and w <= zero)
+
+
+@wp.kernel
+def _find(
+    mesh: wp.uint64,
+    x: wp.array(dtype=wp.vec3d),
+    edges: wp.array(dtype=wp.vec2i),
+    faces: wp.array(dtype=wp.vec3i),
+    pad: float,
+    found: wp.array(dtype=wp.vec2i),
+    count: wp.array(dtype=int),
+):
+    i = wp.tid()
+    e = edges[i]
+    p = x[e[0]]
+    q = x[e[1]]
+    a = wp.vec3(float(p[0]), float(p[1]), float(p[2]))
+    b = wp.vec3(float(q[0]), float(q[1]), float(q[2]))
+    grow = wp.vec3(pad, pad, pad)
+    query = wp.mesh_query_aabb(mesh, wp.min(a, b) - grow, wp.max(a, b) + grow)
+    k = 0
+    while wp.mesh_query_aabb_next(query, k):
+        f = faces[k]
+        apart = f[0] != e[0] and f[1] != e[0] and f[2] != e[0] and f[0] != e[1] and f[1] != e[1] and f[2] != e[1]
+        if apart and _through(p, q, x[f[0]], x[f[1]], x[f[2]]):
+            at = wp.atomic_add(count, 0, 1)
+            if at < found.shape[0]:
+                found[at] = wp.vec2i(i, k)
+
+
+class Crossings:
+    """Finds the crossings of one mesh (of several pieces, if you like) with itself, wherever its vertices move."""
+
+    def __init__(self, faces: NDArray, vertices: int):
+        """``faces`` (F, 3); ``vertices``: how many there are."""
+        self.faces = np.ascontiguousarray(faces, np.int32)
+        ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+        self.edges, which = np.unique(ends, axis=0, return_inverse=True)
+        self.faces_of_edge = faces_of_edges(which.reshape(-1), len(self.edges), len(faces))
+        """(E, 2) the faces that meet at each edge, -1 where there is none; of more than two, the first and the last."""
+        points = wp.zeros(vertices, dtype=wp.vec3, device=DEVICE)
+        self.mesh = wp.Mesh(points, wp.array(self.faces.ravel(), dtype=int, device=DEVICE))
+        self._x = wp.zeros(vertices, dtype=wp.vec3d, device=DEVICE)
+        self._edges = wp.array(self.edges.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
+        self._faces = wp.array(self.faces, dtype=wp.vec3i, device=DEVICE)
+        self._found = wp.zeros(4096, dtype=wp.vec2i, device=DEVICE)
+        self._built = False
+
+    def __call__(self, x: NDArray) -> NDArray:
+        """(K, 2) rows of ``edges`` and of ``faces`` that pass through each other at ``x`` (V, 3), sorted."""
+        self._x.numpy()[:] = x
+        self.mesh.points.numpy()[:] = x
+        if self._built:
+            self.mesh.refit()
+        else:  # a hierarchy made of points that were all alike would be useless for good
+            self.mesh = wp.Mesh(self.mesh.points, self.mesh.indices)
+            self._built = True
+        pad = float(GROW * max(np.abs(x).max(), 1.0)) if len(x) else 0.0
+        while True:
+            count = wp.zeros(1, dtype=int, device=DEVICE)
+            inputs = [self.mesh.id, self._x, self._edges, self._faces, pad, self._found, count]
+            wp.launch(_find, len(self.edges), inputs=inputs, device=DEVICE)
+            total = int(count.numpy()[0])
+            if total <= len(self._found):
+                found = self._found.numpy()[:total].astype(np.int64)
+                return found[np.lexsort((found[:, 1], found[:, 0]))]
+            self._found = wp.zeros(2 * total, dtype=wp.vec2i, device=DEVICE)
+
+    def pairs(self, crossings: NDArray) -> NDArray:
+        """(P, 2) pairs of faces that pass through each other, each once, sorted, of what a call returned."""
+        both = self.faces_of_edge[crossings[:, 0]]
+        pairs = np.concatenate([np.column_stack([both[:, k], crossings[:, 1]]) for k in (0, 1)])
+        pairs = np.sort(pairs[pairs[:, 0] >= 0], 1)
+        return np.unique(pairs, axis=0)
 
 
 def self_intersections(vertices, faces) -> NDArray:
     """(K, 2) pairs of faces that pass through each other, each pair once, sorted.
 
-    ``vertices`` (V, 3) and ``faces`` (F, 3): arrays or tensors.
+    Triangles that share an edge can only overlap by folding flat onto each other, which has no volume and is not
+    counted. ``vertices`` (V, 3) and ``faces`` (F, 3): arrays or tensors.
     """
-    v = np.asarray(_numpy(vertices), np.float64)
-    f = np.asarray(_numpy(faces), np.int64)
-    pairs = _candidates(v, f)
-    shared = (f[pairs[:, 0]][:, :, None] == f[pairs[:, 1]][:, None, :]).sum((1, 2))
-    pairs = pairs[shared < 2]
-    hits = np.zeros(len(pairs), bool)
-    for a, b in ((0, 1), (1, 0)):
-        for k in range(3):
-            p, q = f[pairs[:, a], k], f[pairs[:, a], (k + 1) % 3]
-            other = f[pairs[:, b]]
-            # An edge that ends on the other triangle's corner touches it there by construction.
-            free = ~((p[:, None] == other).any(1) | (q[:, None] == other).any(1)) & ~hits
-            hits[free] |= segment_crosses(v[p[free]], v[q[free]], v[other[free]])
-    found = np.sort(pairs[hits], axis=1)
-    return found[np.lexsort((found[:, 1], found[:, 0]))]
+    x, f = (v.detach().cpu().numpy() if hasattr(v, "detach") else np.asarray(v) for v in (vertices, faces))
+    found = Crossings(f, len(x))
+    return found.pairs(found(x.astype(np.float64)))
 
 
-def segment_crosses(p: NDArray, q: NDArray, triangles: NDArray) -> NDArray:
-    """(N,) whether segments p-q (N, 3) cross triangles (N, 3, 3), ends and borders included; coplanar ones don't count.
-
-    By signs of tetrahedron volumes: no division, so no tolerance.
-    """
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    above, below = _volume(a, b, c, p), _volume(a, b, c, q)
-    split = (above * below <= 0) & ~((above == 0) & (below == 0))
-    u, v, w = _volume(p, q, a, b), _volume(p, q, b, c), _volume(p, q, c, a)
-    through = ((u >= 0) & (v >= 0) & (w >= 0)) | ((u <= 0) & (v <= 0) & (w <= 0))
-    return split & through
-
-
-def _volume(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray:
-    """Six times the signed volume of tetrahedra."""
-    return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a)
-
-
-def _candidates(v: NDArray, f: NDArray) -> NDArray:
-    """(N, 2) pairs of faces whose boxes overlap: neighbours by centre first, then boxes."""
-    from scipy.spatial import cKDTree
-
-    corners = v[f]
-    low, high = corners.min(1), corners.max(1)
-    centre, radius = (low + high) / 2, np.linalg.norm(high - low, axis=1) / 2
-    # A few long triangles would make every search wide: they are searched for on their own.
-    usual = float(np.quantile(radius, 0.98))
-    small, large = np.flatnonzero(radius <= usual), np.flatnonzero(radius > usual)
-    tree = cKDTree(centre[small])
-    found = [small[tree.query_pairs(2 * usual, output_type="ndarray").reshape(-1, 2)]]
-    near = tree.query_ball_point(centre[large], radius[large] + usual)
-    found += [np.stack([np.full(len(n), i), small[n]], 1) for i, n in zip(large, near) if n]
-    if len(large):
-        mates = cKDTree(centre[large]).query_pairs(2 * float(radius[large].max()), output_type="ndarray")
-        found.append(large[mates.reshape(-1, 2)])
-    pairs = np.concatenate(found)
-    overlap = ((low[pairs[:, 0]] <= high[pairs[:, 1]]) & (low[pairs[:, 1]] <= high[pairs[:, 0]])).all(1)
-    return pairs[overlap]
-
-
-def _numpy(values):
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else values
+def faces_of_edges(which: NDArray, edges: int, faces: int) -> NDArray:
+    """(E, 2) faces at each edge; ``which`` (3 F) is the edge of each face's sides, all first sides first."""
+    out = np.full((edges, 2), -1, np.int64)
+    face = np.tile(np.arange(faces), 3)
+    out[which[::-1], 0] = face[::-1]
+    out[which, 1] = face
+    out[out[:, 0] == out[:, 1], 1] = -1
+    return out

@@ -134,7 +134,8 @@ def stack(cloths: Sequence[Cloth]) -> Cloth:
         return torch.cat([getattr(c, name) + (int(n) if shifted else 0) for c, n in zip(cloths, starts)])
 
     moved = {name: joined(name, True) for name in ("faces", "edges", "hinges")}
-    same = {name: joined(name) for name in ("inverse", "areas", "edge_lengths", "hinge_weights", "masses")}
+    plain = ("inverse", "areas", "edge_lengths", "hinge_weights", "masses", "rest_angles")
+    same = {name: joined(name) for name in plain}
     return Cloth(**moved, **same, fabric=cloths[0].fabric)
 
 

@@ -9,6 +9,7 @@ import fcntl
 import hashlib
 import json
 import tempfile
+from collections.abc import Collection
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,15 +81,22 @@ def read_manifest(folder: str | Path | None = None) -> dict[str, dict[str, Any]]
 
 
 def write_weights(
-    name: str, tensors: dict[str, Tensor], card: dict[str, Any], folder: str | Path, dtype: torch.dtype = torch.float16
+    name: str,
+    tensors: dict[str, Tensor],
+    card: dict[str, Any],
+    folder: str | Path,
+    dtype: torch.dtype = torch.float16,
+    exact: Collection[str] = (),
 ) -> Path:
     """Write ``name.safetensors`` (floats as ``dtype``) and enter its card in the manifest; both whole or not at all.
 
     Replaces weights of the same name, leaves the others as they are; several processes may write to one folder.
+    Tensors named in ``exact`` keep their own type: places in metres need more digits than weights.
     """
     folder = Path(folder)
     stored = {
-        k: v.detach().cpu().to(dtype if v.is_floating_point() else v.dtype).contiguous() for k, v in tensors.items()
+        k: v.detach().cpu().to(dtype if v.is_floating_point() and k not in exact else v.dtype).contiguous()
+        for k, v in tensors.items()
     }
     bad = [k for k, v in stored.items() if v.is_floating_point() and not v.isfinite().all()]
     if bad:

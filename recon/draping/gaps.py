@@ -1,0 +1,175 @@
+"""GAPS: a recurrent network drapes one garment on a moving body, frame after frame (GAPS §4.1, Eq. 8).
+
+The garment at rest follows the body by geometry-aware skinning; the network adds displacements in the unposed space,
+from pose, shape and the root's motion. What the network sees does not depend on where the person stands or faces:
+gravity and velocities are given in the pelvis' own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from recon.bodies.rig import rotation_matrices
+from recon.bodies.skin import skin
+from recon.draping.binding import METHODS, BodyField
+from recon.files.weights import read_weights
+from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
+
+FEATURES = 23 * 6 + 3 + 3 + 3
+"""Numbers per frame: joints 1..23 as two columns of their rotations, gravity, velocity and turning of the pelvis."""
+SPEED = 0.3
+"""Factor that brings velocities [m/s, rad/s] to about one."""
+PANELS = ("panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
+"""Index tensors of a garment's panels, as stored."""
+WARM_UP = 8
+"""Frames for which the first pose is held before a motion starts: the hidden state settles."""
+
+
+@dataclass(frozen=True)
+class GapsShape:
+    """What is needed to rebuild the network."""
+
+    vertices: int
+    n_shape: int
+    width: int = 256
+    layers: int = 4
+    scale: float = 0.05
+    """Displacement [m] that an output of one means."""
+
+
+class GapsNet(nn.Module):
+    """R of Eq. 8: GRU layers with tanh, then displacements of all vertices."""
+
+    def __init__(self, shape: GapsShape):
+        super().__init__()
+        self.shape = shape
+        self.gru = nn.GRU(FEATURES + shape.n_shape, shape.width, shape.layers, batch_first=True)
+        self.out = nn.Linear(shape.width, 3 * shape.vertices)
+        nn.init.normal_(self.out.weight, 0.0, 0.01)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Features (B, T, FEATURES), shape (B, S), hidden (L, B, W) -> displacements (B, T, V, 3) [m], hidden."""
+        both = torch.cat([features, shape[:, None].expand(-1, features.shape[1], -1)], -1)
+        states, hidden = self.gru(both, hidden)
+        return self.shape.scale * self.out(states).unflatten(-1, (-1, 3)), hidden
+
+
+def motion_features(
+    pose: Tensor, translation: Tensor, fps: float, before: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """What the network sees of a motion: (B, T, FEATURES).
+
+    Args:
+        pose: (B, T, 24, 3) [rad].
+        translation: (B, T, 3) [m].
+        fps: frames per second.
+        before: pose (B, 24, 3) and translation (B, 3) of the frame before the first; without, the first stands still.
+    """
+    world = rotation_matrices(pose[:, :, 0])
+    joints = rotation_matrices(pose[:, :, 1:])[..., :2].flatten(-3)
+    if before is None:
+        before = pose[:, 0], translation[:, 0]
+    earlier = torch.cat([before[1][:, None], translation[:, :-1]], 1)
+    turned = torch.cat([rotation_matrices(before[0][:, None, 0]), world[:, :-1]], 1)
+    to_own = world.transpose(-1, -2)
+    velocity = (to_own @ ((translation - earlier) * fps)[..., None])[..., 0]
+    turn = to_own @ turned  # from this frame's axes to the last one's
+    skew = (turn.transpose(-1, -2) - turn) / 2
+    spin = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1) * fps
+    return torch.cat([joints, to_own[..., 1], velocity * SPEED, spin * SPEED], -1)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A garment bound to a body: skinning weights and shape directions of its vertices."""
+
+    rest: Tensor
+    """(V, 3) template [m]."""
+    weights: Tensor
+    """(V, 24)."""
+    directions: Tensor
+    """(V, 3, S)."""
+
+    @classmethod
+    def of(cls, garment_vertices: Tensor, faces: Tensor, body, method: str = "rbf") -> Bound:
+        """Bind template vertices (V, 3) by one of ``binding.METHODS``."""
+        found = METHODS[method](BodyField.of(body), garment_vertices, faces)
+        weights = found[:, :24] / found[:, :24].sum(1, keepdim=True)
+        return cls(garment_vertices, weights, found[:, 24:].unflatten(1, (3, -1)))
+
+    def place(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
+        """Displacements (B, V, 3), joint transforms (B, 24, 4, 4), shapes (B, S) -> posed vertices (B, V, 3)."""
+        shaped = self.rest + torch.einsum("vds,bs->bvd", self.directions, shape) + moved
+        return skin(shaped, transforms, self.weights)
+
+
+class GapsDraper:
+    """Drapes the garment that it was trained on over any motion and shape."""
+
+    def __init__(self, net: GapsNet, garment: Garment | Mesh, bound: Bound):
+        """``garment``: the template, a mesh where it has no panels."""
+        self.net = net.eval().requires_grad_(False)
+        self.garment, self.bound = garment, bound
+
+    @torch.no_grad()
+    def animate(self, body: PosedBody, pose: BodyPose, fps: float) -> Tensor:
+        """All frames of one motion at once: (F, V, 3) [m]. ``body``: the F posed bodies of ``pose``."""
+        features = motion_features(pose.pose[None], pose.translation[None], fps)
+        moved, _ = self.net(features, pose.shape[:1], self._warm(features[:, :1], pose.shape[:1]))
+        return self.bound.place(moved[0], body.transforms, pose.shape)
+
+    @torch.no_grad()
+    def stream(self, frames: Iterator[tuple[PosedBody, BodyPose]], fps: float) -> Iterator[Tensor]:
+        """One frame after another, each (1, V, 3) [m], as they come."""
+        hidden, before = None, None
+        for body, pose in frames:
+            features = motion_features(pose.pose[None], pose.translation[None], fps, before)
+            if hidden is None:
+                hidden = self._warm(features, pose.shape)
+            moved, hidden = self.net(features, pose.shape, hidden)
+            before = pose.pose, pose.translation
+            yield self.bound.place(moved[0], body.transforms, pose.shape)
+
+    def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
+        """The hidden state of a body that has stood still in its first pose."""
+        still = first.clone()
+        still[..., -6:] = 0
+        return self.net(still.expand(-1, WARM_UP, -1), shape)[1]
+
+
+def load_gaps(name: str, body, folder: str | Path | None = None) -> GapsDraper:
+    """The draper called ``gaps-NAME`` from ``folder``, or else from the packaged weights, for a body.
+
+    Raises:
+        UserError: weights missing or corrupt, or not those of such a network.
+    """
+    weights = read_weights(f"gaps-{name}", folder)
+    try:
+        return build(weights.tensors, weights.card, body)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise UserError(f"gaps-{name}: weights and card don't describe a GAPS network ({error})") from error
+
+
+def build(tensors: dict[str, Tensor], card: dict, body) -> GapsDraper:
+    """A draper from its stored parts: the network's parameters and ``garment.*``."""
+    net = GapsNet(GapsShape(**card["shape"]))
+    net.load_state_dict({k[4:]: v.float() for k, v in tensors.items() if k.startswith("net.")})
+    mesh = Mesh(tensors["garment.vertices"].float(), tensors["garment.faces"].long())
+    thing: Garment | Mesh = mesh
+    if "kind" in card:
+        panels = {name: tensors[f"garment.{name}"].long() for name in PANELS}
+        thing = Garment(
+            card["kind"],
+            mesh,
+            panel_points=tensors["garment.panel_points"].float(),
+            seam_names=tuple(card["seam_names"]),
+            variant=card["variant"],
+            **panels,
+        )
+    return GapsDraper(net, thing, Bound.of(mesh.vertices, mesh.faces, body, card["skinning"]))
