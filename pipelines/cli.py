@@ -26,6 +26,8 @@ class Command:
     """Name of the module's function of these settings."""
     show: Callable[[Callable[..., Any], Any], int] | None = None
     """Calls (run, settings), shows progress and result and returns the exit code; None = print what comes back."""
+    words: str = ""
+    """The setting that words before the first option fill."""
 
 
 OK, WRONG, INTERRUPTED = 0, 2, 130
@@ -48,8 +50,23 @@ def _show_photo(fit_photo: Callable[..., Any], config: Any) -> int:
     return OK
 
 
+def _show_animation(animate: Callable[..., Any], config: Any) -> int:
+    """Drape with a line a stage on stderr; the figures and where the results lie on stdout."""
+    result = animate(config, say=lambda line: print(line, file=sys.stderr))
+    for name, found in result.figures["garments"].items():
+        print(
+            f"{name}: edges {found['eps_e']:.2f} %, areas {found['eps_a']:.2f} % off the template, "
+            f"{found['eps_c']:.3f} % of vertices inside the body"
+        )
+    print(f"{result.folder}   ({result.figures['frames']} frames, {result.figures['seconds']:.0f} s)")
+    return OK
+
+
 COMMANDS = {
-    "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo),
+    "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo, "photo"),
+    "animate": Command(
+        "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
+    ),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
@@ -119,8 +136,7 @@ def _dispatch(name: str, args: list[str]) -> int:
         import tyro
 
         settings = getattr(module, command.config)
-        positional = (tyro.conf.PositionalRequiredArgs,)
-        config = (_split(tyro.cli(settings, prog=f"recon {name}", args=args, config=positional)),)
+        config = (_split(tyro.cli(settings, prog=f"recon {name}", args=_named(args, command.words))),)
     elif args:
         return _wrong(f"{' '.join(args)}: recon {name} takes nothing")
     if command.show:
@@ -131,6 +147,12 @@ def _dispatch(name: str, args: list[str]) -> int:
     if came is not None:
         print(json.dumps(came, indent=1) if isinstance(came, dict) else came)
     return OK
+
+
+def _named(args: list[str], setting: str) -> list[str]:
+    """The arguments with the words before the first option given to ``setting``."""
+    count = next((k for k, word in enumerate(args) if word.startswith("-")), len(args))
+    return [f"--{setting}", *args] if setting and count else args
 
 
 def _split(config: Any) -> Any:

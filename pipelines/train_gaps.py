@@ -25,7 +25,7 @@ from recon.cloth.energies import Cloth, inertia, towards_template
 from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
-from recon.draping.gaps import Bound, GapsNet, GapsShape, motion_features
+from recon.draping.gaps import Bound, GapsNet, GapsShape, motion_features, smooth_basis
 from recon.files.motions import read_clip
 from recon.files.weights import write_weights
 from recon.garments import WAISTED
@@ -58,20 +58,22 @@ class TrainGaps:
     """Seed of initialisation and sampling."""
     threads: int = 2
     """CPU threads."""
-    windows: int = 4
+    windows: int = 5
     """Windows of motion per step, each on a body of its own."""
-    frames: int = 4
+    frames: int = 3
     """Frames of a window."""
     fps: float = 30.0
     """Frames per second."""
-    shape_spread: float = 1.0
+    shape_spread: float = 0.7
     """Standard deviation of the shape coefficients of training bodies, cut at two."""
-    rate: float = 1e-3
+    rate: float = 2e-3
     """Adam's learning rate at the start; decays along a cosine."""
     width: int = 256
     """Units of each GRU layer."""
     layers: int = 4
     """GRU layers."""
+    modes: int = 500
+    """Smoothest functions on the garment that displacements are learned in."""
     skinning: str = "rbf"
     """How the garment rides on the body: rbf, gaps, nearest, k_nearest or smoothed."""
     inextensibility: float = 2.5e-5
@@ -130,7 +132,7 @@ def train_gaps(config: TrainGaps) -> Path:
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")
     training = learn(template, motions, body, config)
     assert isinstance(training.module, GapsNet)
-    return store(training.module, template, body, config, training)
+    return store(training.module.folded(), template, body, config, training)
 
 
 def read_motions(config: TrainGaps, body: Body) -> list[Motion]:
@@ -152,7 +154,7 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
     """The training itself."""
     torch.manual_seed(config.seed)
     shape = GapsShape(len(template.mesh.vertices), body.n_shape, config.width, config.layers)
-    net = GapsNet(shape)
+    net = GapsNet(shape, smooth_basis(template.mesh.vertices, template.mesh.faces, config.modes))
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
     training = Training(f"gaps-{config.name}", net, adam, _settings(config), config.out)
     training.resume()
@@ -174,8 +176,10 @@ class Loss:
             margin=config.margin,
             inextensibility=config.inextensibility,
             relax=config.relax,
+            deep_share=3,
         )
-        self.physics = FramePhysics(template.cloth, rings, body.faces, weights, config.windows * config.frames)
+        rest = Mesh(body.rest(body.neutral().shape).vertices[0], body.faces)
+        self.physics = FramePhysics(template.cloth, rings, rest, weights, config.windows * config.frames)
 
     def windows(self, generator: torch.Generator) -> tuple[BodyPose, Tensor]:
         """Random windows as bodies (windows * frames) and what the network sees (windows, frames, FEATURES)."""

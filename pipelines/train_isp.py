@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from pipelines.isp_samples import GRID, IspSamples, collect, frame
+from pipelines.training import Budget, Training
 from recon.files.weights import write_weights
 from recon.garments.dataset import Item, load_items
 from recon.garments.isp import IspDecoder, Variant, load_isp
@@ -79,15 +78,12 @@ class TrainIsp:
     """Held-out garments to evaluate on; 0 = none."""
 
 
-@dataclass
-class Progressing:
-    """What changes while training; saved in checkpoints."""
+class Learned(torch.nn.Module):
+    """What learns: the networks and a code per garment."""
 
-    nets: IspNets
-    codes: torch.nn.Parameter
-    optimizer: torch.optim.Adam
-    step: int = 0
-    seconds: float = 0.0
+    def __init__(self, nets: IspNets, codes: Tensor):
+        super().__init__()
+        self.nets, self.codes = nets, torch.nn.Parameter(codes)
 
 
 def train_isp(config: TrainIsp) -> Path:
@@ -119,26 +115,26 @@ def _items(config: TrainIsp, split: str) -> list[Item]:
 
 def learn(
     garments: list[Garment], config: TrainIsp, parameters: Sequence[dict[str, float]] = ()
-) -> tuple[IspDecoder, Progressing]:
+) -> tuple[IspDecoder, Training]:
     """The training itself, for garments of one kind in memory; ``parameters`` they were cut with, where known."""
     torch.set_num_threads(config.threads)
     config.out.mkdir(parents=True, exist_ok=True)
     earlier = load_isp(config.kind, config.start) if config.start is not None else None
     shape = earlier.nets.shape if earlier is not None else _shape(garments, config)
     samples = collect(garments, shape, np.random.default_rng(config.seed), STEP)
-    state = _start(samples, shape, config)
+    training = start(samples, shape, config)
+    learned = training.module
+    assert isinstance(learned, Learned)
     if earlier is not None:
-        state.nets.load_state_dict(earlier.nets.state_dict())
+        learned.nets.load_state_dict(earlier.nets.state_dict())
         with torch.no_grad():
-            state.codes.copy_(known_codes(earlier, samples))
-    checkpoint = config.out / f"isp-{config.kind}.checkpoint"
-    _resume(state, checkpoint, config, len(garments))
-    generator = torch.Generator().manual_seed(config.seed + state.step)
-    _descend(state, samples, config, generator, checkpoint)
-    checkpoint.unlink(missing_ok=True)
+            learned.codes.copy_(known_codes(earlier, samples))
+    training.resume()
+    generator = torch.Generator().manual_seed(config.seed + training.step)
+    training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(learned, samples, config, generator))
     known = parameters or [{}] * len(garments)
     variants = [Variant(g.variant, dict(p)) for g, p in zip(garments, known, strict=True)]
-    return IspDecoder(state.nets, state.codes.detach().clone(), variants), state
+    return IspDecoder(learned.nets, learned.codes.detach().clone(), variants), training
 
 
 def _shape(garments: list[Garment], config: TrainIsp) -> IspShape:
@@ -161,15 +157,16 @@ def known_codes(decoder: IspDecoder, samples: IspSamples, count: int = 256) -> T
     return decoder.codes[best]
 
 
-def _start(samples: IspSamples, shape: IspShape, config: TrainIsp) -> Progressing:
+def start(samples: IspSamples, shape: IspShape, config: TrainIsp) -> Training:
+    """A training that has not begun."""
     torch.manual_seed(config.seed)
-    nets = IspNets(shape)
-    codes = torch.nn.Parameter(first_codes(samples, shape.code))
+    learned = Learned(IspNets(shape), first_codes(samples, shape.code))
     groups = [
-        {"params": list(nets.parameters()), "lr": config.rate},
-        {"params": [codes], "lr": config.code_rate},
+        {"params": list(learned.nets.parameters()), "lr": config.rate},
+        {"params": [learned.codes], "lr": config.code_rate},
     ]
-    return Progressing(nets, codes, torch.optim.Adam(groups, betas=(0.9, 0.99)))
+    adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    return Training(f"isp-{config.kind}", learned, adam, _settings(config, len(samples)), config.out)
 
 
 def first_codes(samples: IspSamples, size: int) -> Tensor:
@@ -183,58 +180,17 @@ def first_codes(samples: IspSamples, size: int) -> Tensor:
     return F.pad(scores, (0, size - keep)) + 0.01 * torch.randn(len(samples), size)
 
 
-def _descend(
-    state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator, checkpoint: Path
-) -> None:
-    """Adam along a cosine that follows the time spent (or the steps, if they are fixed)."""
-    columns = (
-        TextColumn("isp {task.fields[kind]}"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
-    log = open(config.out / f"isp-{config.kind}.log.jsonl", "a")
-    budget, saved = config.minutes * 60, state.seconds
-    smooth: dict[str, float] = {}
-    with log, Progress(*columns) as progress:
-        bar = progress.add_task("train", total=1.0, kind=config.kind, note="")
-        while (share := state.step / config.steps if config.steps else state.seconds / budget) < 1:
-            begun = time.perf_counter()
-            rate = min(1.0, (state.step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * share) + 2e-3)
-            for group, full in zip(state.optimizer.param_groups, (config.rate, config.code_rate), strict=True):
-                group["lr"] = full * rate
-            terms = take_step(state, samples, config, generator)
-            state.step += 1
-            state.seconds += time.perf_counter() - begun
-            smooth = {k: 0.97 * smooth.get(k, v) + 0.03 * v for k, v in terms.items()}
-            if state.step % 100 == 0:
-                log.write(json.dumps({"step": state.step, "seconds": round(state.seconds, 1), **smooth}) + "\n")
-                log.flush()
-                note = (
-                    f"step {state.step}  surface {smooth['surface_mm']:.2f} mm  pattern {smooth['pattern_mm']:.2f} mm"
-                )
-                progress.update(bar, completed=share, note=note)
-            if state.seconds - saved > 60:
-                saved = state.seconds
-                _save(state, checkpoint, config, len(samples))
-
-
-def take_step(
-    state: Progressing, samples: IspSamples, config: TrainIsp, generator: torch.Generator
-) -> dict[str, float]:
-    """One step on a random batch; returns the terms in millimetres or natural units."""
+def batch_loss(
+    learned: Learned, samples: IspSamples, config: TrainIsp, generator: torch.Generator
+) -> tuple[Tensor, dict[str, float]]:
+    """The loss of a random batch, and its terms in millimetres or natural units."""
     garments = torch.randperm(len(samples), generator=generator)[: config.batch]
-    z = state.codes[garments]
-    surface, measured = surface_loss(state.nets, z, samples, garments, config, generator)
-    pattern, more = pattern_loss(state.nets, z, samples, garments, config.pattern_points, generator)
+    z = learned.codes[garments]
+    surface, measured = surface_loss(learned.nets, z, samples, garments, config, generator)
+    pattern, more = pattern_loss(learned.nets, z, samples, garments, config.pattern_points, generator)
     loss = surface + pattern + 1e-4 * z.square().sum(1).mean()
-    state.optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_(state.nets.parameters(), 1.0)
-    if bool(torch.isfinite(loss)):
-        state.optimizer.step()
-    scale = state.nets.shape.half * 1e3
-    return {k: float(v) * (scale if k.endswith("_mm") else 1.0) for k, v in {**measured, **more}.items()}
+    scale = learned.nets.shape.half * 1e3
+    return loss, {k: float(v) * (scale if k.endswith("_mm") else 1.0) for k, v in {**measured, **more}.items()}
 
 
 def pattern_loss(
@@ -305,38 +261,6 @@ def _compare(found: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tensor]:
     return {"point": point, "difference": (off * whole).sum() / total, "normal": (turned * whole).sum() / total}
 
 
-def _save(state: Progressing, path: Path, config: TrainIsp, count: int) -> None:
-    beside = path.with_suffix(".tmp")
-    torch.save(
-        {
-            "nets": state.nets.state_dict(),
-            "codes": state.codes.detach(),
-            "optimizer": state.optimizer.state_dict(),
-            "step": state.step,
-            "seconds": state.seconds,
-            "settings": _settings(config, count),
-        },
-        beside,
-    )
-    beside.replace(path)
-
-
-def _resume(state: Progressing, path: Path, config: TrainIsp, count: int) -> None:
-    if not path.is_file():
-        return
-    try:
-        kept = torch.load(path, weights_only=True)
-    except Exception as error:
-        raise UserError(f"{path}: not a readable checkpoint; delete it to train from the start") from error
-    if kept["settings"] != _settings(config, count):
-        raise UserError(f"{path}: checkpoint of other settings; finish that training or delete it")
-    state.nets.load_state_dict(kept["nets"])
-    with torch.no_grad():
-        state.codes.copy_(kept["codes"])
-    state.optimizer.load_state_dict(kept["optimizer"])
-    state.step, state.seconds = kept["step"], kept["seconds"]
-
-
 def _settings(config: TrainIsp, count: int) -> str:
     """What a checkpoint must agree with to go on from it."""
     free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
@@ -345,7 +269,7 @@ def _settings(config: TrainIsp, count: int) -> str:
     )
 
 
-def store(decoder: IspDecoder, config: TrainIsp, done: Progressing, metrics: dict[str, dict[str, float]]) -> Path:
+def store(decoder: IspDecoder, config: TrainIsp, done: Training, metrics: dict[str, dict[str, float]]) -> Path:
     """Write ``isp-<kind>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
     tensors = {"codes": decoder.codes, **decoder.nets.state_dict()}
     card = {

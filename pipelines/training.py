@@ -83,7 +83,7 @@ class Training:
         self.out.mkdir(parents=True, exist_ok=True)
         rates = [group.setdefault("first_lr", group["lr"]) for group in self.optimizer.param_groups]
         columns = TextColumn(self.name), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
-        saved, smooth = self.seconds, {}
+        saved, smooth = self.seconds, dict[str, float]()
         with open(self.out / f"{self.name}.log.jsonl", "a") as log, Progress(*columns) as progress:
             bar = progress.add_task("train", total=1.0, note="")
             while (share := self._share(budget)) < 1:

@@ -142,8 +142,8 @@ def _mended(clip: Clip) -> tuple[Clip, tuple[str, ...]]:
     """The clip with bad frames interpolated, and a line about them."""
     frames = len(clip.local)
     sound = np.isfinite(clip.local).all((1, 2, 3)) & np.isfinite(clip.root).all(1)
-    last = None
-    for k in np.flatnonzero(sound):
+    last: int | None = None
+    for k in np.flatnonzero(sound).tolist():
         if last is not None and _turn(clip.local[last], clip.local[k]) * clip.fps / (k - last) > FASTEST:
             sound[k] = False
             continue

@@ -51,9 +51,9 @@ def elastic(cloth: Cloth, device: str) -> Elastic:
 
 
 @wp.func
-def membrane(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: Elastic, t: int):
-    """StVK energy [J] of triangle t; adds its gradient [N] to g."""
-    f = e.faces[t]
+def membrane(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: Elastic, t: int, first: int):
+    """StVK energy [J] of triangle t, vertices counted from ``first``; adds its gradient [N] to g."""
+    f = e.faces[t] + wp.vec3i(first, first, first)
     i = e.inverse[t]
     b = x[f[1]] - x[f[0]]
     c = x[f[2]] - x[f[0]]
@@ -77,9 +77,9 @@ def membrane(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: Elasti
 
 
 @wp.func
-def hinge(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: Elastic, k: int):
-    """Bending energy [J] of hinge k; adds its gradient [N] to g. Degenerate hinges give nothing."""
-    h = e.hinges[k]
+def hinge(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: Elastic, k: int, first: int):
+    """Bending energy [J] of hinge k, as ``membrane``. Degenerate hinges give nothing."""
+    h = e.hinges[k] + wp.vec4i(first, first, first, first)
     a = x[h[0]]
     b = x[h[1]]
     edge = b - a

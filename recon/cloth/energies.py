@@ -197,9 +197,13 @@ def inertia(cloth: Cloth, x: Tensor, before: Tensor, earlier: Tensor, step: floa
     return (cloth.masses[:, None] * off.square()).sum((-1, -2)) / (2 * step**2)
 
 
-def collision(depth: Tensor, stiffness: float) -> Tensor:
-    """GAPS Eq. 11 (...,) [J]: ``depth`` (..., V) lack of distance from the body, max(eps - d, 0) [m]."""
-    return stiffness * depth.pow(3).sum(-1)
+def collision(depth: Tensor, stiffness: float, steep: float = float("inf")) -> Tensor:
+    """GAPS Eq. 11 (...,) [J]: ``depth`` (..., V) lack of distance from the body, max(eps - d, 0) [m].
+
+    Beyond the depth ``steep`` it goes on as a straight line.
+    """
+    cubic = depth.clamp(max=steep)
+    return stiffness * (cubic.pow(3) + 3 * cubic.square() * (depth - cubic)).sum(-1)
 
 
 def gravity(cloth: Cloth, x: Tensor) -> Tensor:

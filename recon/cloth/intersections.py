@@ -54,7 +54,7 @@ def _find(
     b = wp.vec3(float(q[0]), float(q[1]), float(q[2]))
     grow = wp.vec3(pad, pad, pad)
     query = wp.mesh_query_aabb(mesh, wp.min(a, b) - grow, wp.max(a, b) + grow)
-    k = 0
+    k = int(0)  # noqa: UP018 (a literal would be a constant of the kernel)
     while wp.mesh_query_aabb_next(query, k):
         f = faces[k]
         apart = f[0] != e[0] and f[1] != e[0] and f[2] != e[0] and f[0] != e[1] and f[1] != e[1] and f[2] != e[1]

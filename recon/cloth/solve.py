@@ -1,8 +1,7 @@
 """Quasi-static rest of a garment on a body: minimise elastic energy, gravity and contact by L-BFGS.
 
-Energy and gradient are those of :mod:`recon.cloth.energies` (tests compare them), written out in one compiled
-double-precision kernel on one thread: a hundred times cheaper than automatic differentiation, and the digits suffice
-for a line search.
+Energy and gradient are those of :mod:`recon.cloth.energies` (tests compare them), in one compiled kernel in doubles
+on one thread: the digits suffice for a line search.
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from recon.cloth.contact import BodyContact
-from recon.cloth.energies import GRAVITY, Cloth
+from recon.cloth.elastic import Elastic, elastic, hinge, membrane
+from recon.cloth.energies import Cloth
 from recon.cloth.xpbd import Constraints, close_strangers, held_height
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
@@ -77,19 +77,6 @@ class Contacts:
 
 
 @wp.struct
-class _Elastic:
-    faces: wp.array(dtype=wp.vec3i)
-    inverse: wp.array(dtype=wp.mat22d)
-    areas: wp.array(dtype=wp.float64)
-    hinges: wp.array(dtype=wp.vec4i)
-    hinge_weights: wp.array(dtype=wp.float64)
-    weights: wp.array(dtype=wp.float64)
-    mu: wp.float64
-    lam: wp.float64
-    bending: wp.float64
-
-
-@wp.struct
 class _Contacts:
     vertex: wp.array(dtype=int)
     point: wp.array(dtype=wp.vec3d)
@@ -103,75 +90,18 @@ class _Contacts:
     stiffness: wp.float64
 
 
-@wp.func
-def _membrane(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: _Elastic, t: int):
-    f = e.faces[t]
-    i = e.inverse[t]
-    b = x[f[1]] - x[f[0]]
-    c = x[f[2]] - x[f[0]]
-    u = b * i[0, 0] + c * i[1, 0]
-    v = b * i[0, 1] + c * i[1, 1]
-    half = wp.float64(0.5)
-    uu = half * (wp.dot(u, u) - wp.float64(1.0))
-    vv = half * (wp.dot(v, v) - wp.float64(1.0))
-    uv = half * wp.dot(u, v)
-    trace = uu + vv
-    two_mu = wp.float64(2.0) * e.mu
-    a = e.areas[t]
-    du = (u * (two_mu * uu + e.lam * trace) + v * (two_mu * uv)) * a
-    dv = (v * (two_mu * vv + e.lam * trace) + u * (two_mu * uv)) * a
-    gb = du * i[0, 0] + dv * i[0, 1]
-    gc = du * i[1, 0] + dv * i[1, 1]
-    g[f[1]] = g[f[1]] + gb
-    g[f[2]] = g[f[2]] + gc
-    g[f[0]] = g[f[0]] - gb - gc
-    return a * (e.mu * (uu * uu + vv * vv + wp.float64(2.0) * uv * uv) + half * e.lam * trace * trace)
-
-
-@wp.func
-def _hinge(x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), e: _Elastic, k: int):
-    h = e.hinges[k]
-    a = x[h[0]]
-    b = x[h[1]]
-    edge = b - a
-    c = x[h[2]]
-    d = x[h[3]]
-    left = wp.cross(edge, c - a)
-    right = wp.cross(d - a, edge)
-    ll = wp.dot(left, left)
-    rr = wp.dot(right, right)
-    length = wp.length(edge)
-    energy = wp.float64(0.0)
-    if ll * rr > wp.float64(1.0e-26) and length > wp.float64(1.0e-6):
-        angle = wp.atan2(wp.dot(wp.cross(left, right), edge) / length, wp.dot(left, right))
-        scale = wp.float64(2.0) * e.bending * e.hinge_weights[k] * angle
-        # Gradient of a dihedral angle (Bridson et al. 2003): along the two normals, shared out at the edge's ends.
-        nl = left * (scale / ll)
-        nr = right * (scale / rr)
-        gc = nl * (-length)
-        gd = nr * (-length)
-        ga = nl * (-wp.dot(c - b, edge) / length) + nr * (-wp.dot(d - b, edge) / length)
-        gb = nl * (wp.dot(c - a, edge) / length) + nr * (wp.dot(d - a, edge) / length)
-        g[h[0]] = g[h[0]] + ga
-        g[h[1]] = g[h[1]] + gb
-        g[h[2]] = g[h[2]] + gc
-        g[h[3]] = g[h[3]] + gd
-        energy = e.bending * e.hinge_weights[k] * angle * angle
-    return energy
-
-
 @wp.kernel
 def _evaluate(
-    x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.float64), e: _Elastic, c: _Contacts
+    x: wp.array(dtype=wp.vec3d), g: wp.array(dtype=wp.vec3d), out: wp.array(dtype=wp.float64), e: Elastic, c: _Contacts
 ):
     total = wp.float64(0.0)
     for i in range(x.shape[0]):
         g[i] = wp.vec3d(wp.float64(0.0), e.weights[i], wp.float64(0.0))
         total += e.weights[i] * x[i][1]
     for t in range(e.faces.shape[0]):
-        total += _membrane(x, g, e, t)
+        total += membrane(x, g, e, t, 0)
     for k in range(e.hinges.shape[0]):
-        total += _hinge(x, g, e, k)
+        total += hinge(x, g, e, k, 0)
     two = wp.float64(2.0)
     for k in range(c.vertex.shape[0]):
         i = c.vertex[k]
@@ -208,15 +138,7 @@ class ElasticEnergy:
     """Energy [J] and gradient [N] of a cloth under gravity, with the contacts set by :meth:`touch`."""
 
     def __init__(self, cloth: Cloth):
-        e = _Elastic()
-        e.faces = wp.array(_ints(cloth.faces), dtype=wp.vec3i, device=DEVICE)
-        e.inverse = wp.array(_doubles(cloth.inverse), dtype=wp.mat22d, device=DEVICE)
-        e.areas = wp.array(_doubles(cloth.areas) * cloth.fabric.thickness, dtype=wp.float64, device=DEVICE)
-        e.hinges = wp.array(_ints(cloth.hinges), dtype=wp.vec4i, device=DEVICE)
-        e.hinge_weights = wp.array(_doubles(cloth.hinge_weights), dtype=wp.float64, device=DEVICE)
-        e.weights = wp.array(_doubles(cloth.masses) * GRAVITY, dtype=wp.float64, device=DEVICE)
-        e.mu, e.lam, e.bending = cloth.fabric.lame_mu, cloth.fabric.lame_lambda, cloth.fabric.bending
-        self.elastic = e
+        self.elastic = elastic(cloth, DEVICE)
         count = len(cloth.masses)
         self.x = wp.zeros(count, dtype=wp.vec3d, device=DEVICE)
         self.gradient = wp.zeros(count, dtype=wp.vec3d, device=DEVICE)
@@ -347,11 +269,3 @@ def _two_loops(
     for (s, y, rho), alpha in zip(steps, reversed(alphas)):
         q += (alpha - rho * float((y * q).sum())) * s
     return q
-
-
-def _ints(tensor) -> NDArray:
-    return np.ascontiguousarray(tensor.numpy(), np.int32)
-
-
-def _doubles(tensor) -> NDArray:
-    return np.ascontiguousarray(tensor.double().numpy())

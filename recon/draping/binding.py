@@ -151,7 +151,7 @@ def settle(field: BodyField, features: Tensor, points: Tensor, faces: Tensor | N
     if faces is None or len(faces) == 0:
         return features
     x, f = points.detach().cpu().double().numpy(), faces.cpu().numpy()
-    stiffness, mass = _cloth_operators(x, f, ((SLACK * field.distance(x)) ** 2)[f].mean(1))
+    stiffness, mass = cloth_operators(x, f, ((SLACK * field.distance(x)) ** 2)[f].mean(1))
     matrix = (sp.diags(mass) + stiffness).tocsr().astype(np.float32)
     weights = features[:, :JOINTS].detach().cpu().float().numpy()
     active = np.flatnonzero(weights.max(0) > 1e-3)  # a skirt has no hands
@@ -184,7 +184,7 @@ def _conjugate_gradients(matrix: sp.csr_matrix, right: np.ndarray, start: np.nda
     return x
 
 
-def _cloth_operators(x: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> tuple[sp.csr_matrix, np.ndarray]:
+def cloth_operators(x: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> tuple[sp.csr_matrix, np.ndarray]:
     """Stiffness (N, N) of -div(factor grad) with linear elements, factor (F,) [m2], and lumped mass (N,) [m2].
 
     Cotangents below 0.05 are raised to it: every row stays an average of its neighbours, whatever the triangles.

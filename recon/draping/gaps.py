@@ -11,12 +11,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import scipy.sparse as sp
 import torch
+from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 
 from recon.bodies.rig import rotation_matrices
 from recon.bodies.skin import skin
-from recon.draping.binding import METHODS, BodyField
+from recon.draping.binding import METHODS, BodyField, cloth_operators
 from recon.files.weights import read_weights
 from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
 
@@ -26,6 +29,8 @@ SPEED = 0.3
 """Factor that brings velocities [m/s, rad/s] to about one."""
 PANELS = ("panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
 """Index tensors of a garment's panels, as stored."""
+COARSE = 150.0
+"""Laplacian eigenvalue [1/m²] of waves half a metre long: as smooth as cloth on a body mostly is."""
 WARM_UP = 8
 """Frames for which the first pose is held before a motion starts: the hidden state settles."""
 
@@ -45,11 +50,15 @@ class GapsShape:
 class GapsNet(nn.Module):
     """R of Eq. 8: GRU layers with tanh, then displacements of all vertices."""
 
-    def __init__(self, shape: GapsShape):
+    basis: Tensor | None
+
+    def __init__(self, shape: GapsShape, basis: Tensor | None = None):
+        """``basis`` (V, M), for learning: the network gives coefficients of these columns; see :func:`smooth_basis`."""
         super().__init__()
         self.shape = shape
+        self.register_buffer("basis", basis, persistent=False)
         self.gru = nn.GRU(FEATURES + shape.n_shape, shape.width, shape.layers, batch_first=True)
-        self.out = nn.Linear(shape.width, 3 * shape.vertices)
+        self.out = nn.Linear(shape.width, 3 * (shape.vertices if basis is None else basis.shape[1]))
         nn.init.normal_(self.out.weight, 0.0, 0.01)
         nn.init.zeros_(self.out.bias)
 
@@ -57,7 +66,35 @@ class GapsNet(nn.Module):
         """Features (B, T, FEATURES), shape (B, S), hidden (L, B, W) -> displacements (B, T, V, 3) [m], hidden."""
         both = torch.cat([features, shape[:, None].expand(-1, features.shape[1], -1)], -1)
         states, hidden = self.gru(both, hidden)
-        return self.shape.scale * self.out(states).unflatten(-1, (-1, 3)), hidden
+        moved = self.out(states).unflatten(-1, (-1, 3))
+        return self.shape.scale * (moved if self.basis is None else self.basis @ moved), hidden
+
+    def folded(self) -> GapsNet:
+        """The same function without a basis: its columns are multiplied into the last layer."""
+        if self.basis is None:
+            return self
+        net = GapsNet(self.shape)
+        net.gru.load_state_dict(self.gru.state_dict())
+        with torch.no_grad():
+            weight = torch.einsum("vm,mdw->vdw", self.basis, self.out.weight.unflatten(0, (-1, 3)))
+            net.out.weight.copy_(weight.flatten(0, 1))
+            net.out.bias.copy_((self.basis @ self.out.bias.unflatten(0, (-1, 3))).flatten())
+        return net
+
+
+def smooth_basis(vertices: Tensor, faces: Tensor, count: int) -> Tensor:
+    """(V, M) the ``count`` smoothest functions on a mesh, eigenvectors of its Laplacian, fine ones scaled down.
+
+    Stretching costs a mode its eigenvalue: divided by the root of it, all coefficients are about as stiff, and learning
+    is no longer slowed down by single vertices. Constant modes keep size one.
+    """
+    x, f = vertices.detach().cpu().double().numpy(), faces.cpu().numpy()
+    stiffness, mass = cloth_operators(x, f, np.ones(len(f)))
+    count = min(count, len(x) - 2)
+    start = np.random.default_rng(0).standard_normal(len(x))
+    values, modes = eigsh(stiffness, count, sp.diags(mass), sigma=-1e-3, v0=start)
+    modes = modes * np.sqrt(mass.sum())
+    return torch.as_tensor(modes / np.sqrt(1 + np.maximum(values, 0) / COARSE)).float()
 
 
 def motion_features(

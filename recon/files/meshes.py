@@ -74,11 +74,9 @@ def write_glb(parts: Mapping[str, tuple[Mesh | Garment, Colour]], path: str | Pa
         mesh = thing.mesh if isinstance(thing, Garment) else thing
         vertices, faces = finite_vertices(mesh, name), mesh.faces.cpu().numpy()
         shape = trimesh.Trimesh(vertices, faces, vertex_normals=_normals(vertices, faces), process=False)
-        # glTF wants colour factors linear; people name colours in sRGB.
-        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
         material = trimesh.visual.material.PBRMaterial(
             name=name,
-            baseColorFactor=np.round([255 * c for c in (*linear, 1.0)]).astype(np.uint8),
+            baseColorFactor=np.round([255 * c for c in (*linear_colour(colour), 1.0)]).astype(np.uint8),
             metallicFactor=0.0,
             roughnessFactor=0.9,
             doubleSided=garment,
@@ -86,6 +84,11 @@ def write_glb(parts: Mapping[str, tuple[Mesh | Garment, Colour]], path: str | Pa
         shape.visual = trimesh.visual.TextureVisuals(material=material)
         scene.add_geometry(shape, node_name=name, geom_name=name)
     write_whole(path, trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+
+
+def linear_colour(colour: Colour) -> list[float]:
+    """sRGB -> linear: glTF wants colour factors linear, people name colours in sRGB."""
+    return [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -159,15 +159,16 @@ def test_training_resumes_from_its_checkpoint(tmp_path, tubes):
     config = t.TrainIsp(kind="skirt", out=tmp_path, steps=3, threads=1, batch=2, width=16, code=4, evaluate=0)
     shape = replace(t.frame(tubes, 4), width=16)
     samples = t.collect(tubes[:2], shape, np.random.default_rng(0))
-    state = t._start(samples, shape, config)
-    path = tmp_path / "c"
-    t._descend(state, samples, config, torch.Generator().manual_seed(0), path)
-    t._save(state, path, config, 2)
-    other = t._start(samples, shape, replace(config, steps=5))
-    t._resume(other, path, config, 2)
-    assert other.step == 3 and torch.equal(other.codes, state.codes)
+    training = t.start(samples, shape, config)
+    generator = torch.Generator().manual_seed(0)
+    training.run(t.Budget(1, 3), lambda share: t.batch_loss(training.module, samples, config, generator))
+    assert training.step == 3 and not training.checkpoint.exists()
+    training.save()
+    other = t.start(samples, shape, replace(config, steps=5))
+    other.resume()
+    assert other.step == 3 and torch.equal(other.module.codes, training.module.codes)
     with pytest.raises(UserError, match="other settings"):
-        t._resume(other, path, replace(config, seed=4), 2)
+        t.start(samples, shape, replace(config, seed=4)).resume()
 
 
 def test_the_prior_knows_typical_codes():

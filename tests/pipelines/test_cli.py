@@ -40,7 +40,7 @@ def fake(monkeypatch):
     """A module with ``Settings`` and a ``run`` behind ``recon fake it``; returns its namespace."""
     module = SimpleNamespace(__name__="fake", Settings=Settings, run=lambda config: config.photo)
     monkeypatch.setitem(sys.modules, "fake", module)
-    monkeypatch.setitem(cli.COMMANDS, "fake it", cli.Command("fakes", "fake", "Settings", "run"))
+    monkeypatch.setitem(cli.COMMANDS, "fake it", cli.Command("fakes", "fake", "Settings", "run", words="photo"))
     return module
 
 

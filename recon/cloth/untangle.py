@@ -1,0 +1,338 @@
+"""Untangle: draped layers in, layers out that pass neither through each other, nor themselves, nor the body.
+
+Rounds of small moves until an exact test finds nothing:
+
+- vertices and face centres inside the body go out along the way to its surface;
+- between layers the order is known: a vertex of the outer one on the wrong side of the inner one's faces goes back to
+  its own side, and what is left of crossing edges is drawn apart along the inner layer's outward direction;
+- within a layer nobody knows which side is right: crossing edges and faces move so that the curve along which the cloth
+  passes through itself grows shorter (Volino & Magnenat-Thalmann 2006);
+- edges are brought back to the lengths they came with, so that repairs spread instead of stretching the cloth.
+
+Only what is tangled, and what hangs on it, moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import warp as wp
+from numpy.typing import NDArray
+
+from recon.cloth.contact import BodyContact
+from recon.cloth.intersections import Crossings
+from recon.types import Mesh
+
+wp.set_module_options({"enable_backward": False})
+
+DEVICE = "cpu"
+
+
+@dataclass(frozen=True)
+class Untangling:
+    """How layers are untangled."""
+
+    rounds: int = 120
+    """Most rounds."""
+    body: float = 5e-4
+    """Distance from the body that every vertex and face centre ends with [m]."""
+    gap: float = 1e-3
+    """Distance that layers are drawn apart where they cross [m]."""
+    reach: float = 0.025
+    """Layers deeper in each other than this are not recognised [m]."""
+    curve: float = 0.6
+    """Longest step against the curve of self-intersection per round, in mean edge lengths."""
+    sweeps: int = 4
+    """Sweeps per round over the edges near a repair."""
+    stiffness: float = 0.5
+    """Share of an edge's error that a sweep takes back."""
+
+
+@dataclass(frozen=True)
+class Untangled:
+    """Where it ends."""
+
+    vertices: list[NDArray]
+    """(V, 3) of each layer, as they came [m]."""
+    crossings: int
+    """Pairs of faces that still pass through each other, before it began."""
+    left: NDArray
+    """(P, 2) pairs of faces that still do, counted through all layers; empty where it worked."""
+    inside: int
+    """Vertices and face centres that are still inside the body."""
+    rounds: int
+    """How many it took."""
+    notes: tuple[str, ...] = field(default=())
+    """Where it could not, one line each."""
+
+    @property
+    def clean(self) -> bool:
+        """Nothing is left."""
+        return not len(self.left) and not self.inside
+
+
+@wp.kernel
+def _keep_lengths(
+    x: wp.array(dtype=wp.vec3d),
+    pair: wp.array(dtype=wp.vec2i),
+    length: wp.array(dtype=wp.float64),
+    stiffness: wp.float64,
+    sweeps: int,
+):
+    for _s in range(sweeps):
+        for k in range(pair.shape[0]):
+            p = pair[k]
+            d = x[p[0]] - x[p[1]]
+            now = wp.length(d)
+            if now > wp.float64(1.0e-9):
+                move = d * (wp.float64(0.5) * stiffness * (length[k] - now) / now)
+                x[p[0]] = x[p[0]] + move
+                x[p[1]] = x[p[1]] - move
+
+
+def untangle(layers: Sequence[Mesh], body: Mesh | None = None, settings: Untangling | None = None) -> Untangled:
+    """Draw apart what passes through each other.
+
+    Args:
+        layers: draped garments (V, 3), outermost first; faces counter-clockwise from outside.
+        body: what they are worn on; its faces outward.
+        settings: see :class:`Untangling`.
+
+    Returns:
+        The layers moved, and what is left. Layers that are clean come back as they were.
+    """
+    tangle = _Tangle(layers, body, settings or Untangling())
+    return tangle.solve()
+
+
+class _Tangle:
+    def __init__(self, layers: Sequence[Mesh], body: Mesh | None, settings: Untangling):
+        self.settings = settings
+        sizes = [len(m.vertices) for m in layers]
+        self.starts = np.cumsum([0, *sizes])
+        self.layer = np.repeat(np.arange(len(layers)), sizes)
+        self.x = np.concatenate([m.vertices.detach().cpu().double().numpy() for m in layers])
+        faces = [m.faces.cpu().numpy() + at for m, at in zip(layers, self.starts[:-1])]
+        self.first_face = np.cumsum([0, *[len(f) for f in faces]])
+        self.faces = np.concatenate(faces)
+        self.crossings = Crossings(self.faces, len(self.x))
+        self.edges = self.crossings.edges
+        self.lengths = np.linalg.norm(self.x[self.edges[:, 0]] - self.x[self.edges[:, 1]], axis=1)
+        self.scale = float(self.lengths.mean())
+        self.rims = self._rims()
+        self.body = None
+        if body is not None:
+            self.body = BodyContact(body.vertices.detach().cpu().double(), body.faces.cpu())
+
+    def _rims(self) -> NDArray:
+        """(V,) whether a vertex lies on an open border."""
+        open_edges = self.edges[self.crossings.faces_of_edge[:, 1] < 0]
+        rim = np.zeros(len(self.x), bool)
+        rim[open_edges] = True
+        return rim
+
+    def solve(self) -> Untangled:
+        s = self.settings
+        found = self.crossings(self.x)
+        before = len(self.crossings.pairs(found))
+        lack = self._lack()
+        rounds = 0
+        while (len(found) or lack.any()) and rounds < s.rounds:
+            moved = np.zeros(len(self.x), bool)
+            if len(found):
+                if len(self.starts) > 2 and rounds % 4 == 0:
+                    moved |= self._back_to_own_side()
+                    found = self.crossings(self.x)
+                moved |= self._draw_apart(found, rounds)
+            moved |= self._leave_body(rounds)
+            self._relax(moved, rounds)
+            self._leave_body(rounds)
+            found, lack = self.crossings(self.x), self._lack()
+            rounds += 1
+        left = self.crossings.pairs(found)
+        return Untangled(
+            [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])],
+            before,
+            left,
+            int(lack.sum()),
+            rounds,
+            self._notes(left, int(lack.sum())),
+        )
+
+    def _notes(self, left: NDArray, inside: int) -> tuple[str, ...]:
+        lines = []
+        of = np.searchsorted(self.first_face, left, side="right") - 1
+        for pair in np.unique(np.sort(of, 1), axis=0) if len(left) else []:
+            mine = left[(np.sort(of, 1) == pair).all(1)]
+            at = self.x[self.faces[mine[:, 0]]].mean((0, 1))
+            who = f"layer {pair[0]}" if pair[0] == pair[1] else f"layers {pair[0]} and {pair[1]}"
+            place = ", ".join(f"{v:.3f}" for v in at)
+            lines.append(f"{who}: {len(mine)} pairs of faces still cross around ({place}) m")
+        if inside:
+            lines.append(f"{inside} vertices and face centres are still inside the body")
+        return tuple(lines)
+
+    def _lack(self) -> NDArray:
+        """(V + F,) whether vertices and face centres are inside the body."""
+        if self.body is None:
+            return np.zeros(0, bool)
+        return self.body.signed_distance(self._points()).numpy() < 0
+
+    def _points(self) -> torch.Tensor:
+        return torch.from_numpy(np.concatenate([self.x, self.x[self.faces].mean(1)]))
+
+    def _leave_body(self, number: int) -> NDArray:
+        """Vertices and face centres closer to the body than the margin go out; returns which vertices moved."""
+        moved = np.zeros(len(self.x), bool)
+        if self.body is None:
+            return moved
+        late = max(0.0, 2 * number / self.settings.rounds - 1)
+        for _ in range(3):
+            points = self._points().requires_grad_()
+            distance = self.body.signed_distance(points)
+            (normal,) = torch.autograd.grad(distance.sum(), points)
+            wanted = self.settings.body * (1 - 0.9 * late)
+            lack = np.maximum(wanted - distance.detach().numpy(), 0) * (1.05 + 3 * late)
+            if not lack.any():
+                break
+            move = lack[:, None] * normal.numpy()
+            n = len(self.x)
+            self.x[lack[:n] > 0] += move[:n][lack[:n] > 0]
+            at = np.flatnonzero(lack[n:])
+            self._scatter(self.faces[at].ravel(), np.repeat(move[n:][at], 3, 0))
+            moved[lack[:n] > 0] = True
+            moved[self.faces[at].ravel()] = True
+        return moved
+
+    def _scatter(self, vertices: NDArray, moves: NDArray) -> None:
+        """Add the mean of the moves asked for at each vertex."""
+        total, count = np.zeros_like(self.x), np.bincount(vertices, minlength=len(self.x))
+        np.add.at(total, vertices, moves)
+        self.x += total / np.maximum(count, 1)[:, None]
+
+    def _back_to_own_side(self) -> NDArray:
+        """Outer vertices beneath an inner layer's faces go back over them, each gives way by half."""
+        moved = np.zeros(len(self.x), bool)
+        for k in range(len(self.starts) - 2):
+            for j in range(k + 1, len(self.starts) - 1):
+                moved |= self._over(k, j)
+        return moved
+
+    def _over(self, k: int, j: int) -> NDArray:
+        s = self.settings
+        outer, inner = slice(*self.starts[k : k + 2]), slice(*self.starts[j : j + 2])
+        faces = self.faces[self.first_face[j] : self.first_face[j + 1]] - self.starts[j]
+        surface = BodyContact(torch.from_numpy(self.x[inner].copy()), torch.from_numpy(faces))
+        face, weights, sign = (t.numpy() for t in surface.closest(torch.from_numpy(self.x[outer].copy())))
+        corners = faces[face] + self.starts[j]
+        away = self.x[outer] - (self.x[corners] * weights[..., None]).sum(1)
+        distance = np.linalg.norm(away, axis=1)
+        wrong = (sign < 0) & (distance < s.reach) & (distance > 1e-9)
+        wrong &= ~(self.rims[corners] | (weights < 1e-3)).all(1)  # beside an open border there are no sides
+        at = np.flatnonzero(wrong)
+        push = -away[at] / distance[at, None] * (distance[at] + s.gap)[:, None]
+        vertices = np.concatenate([at + self.starts[k], corners[at].ravel()])
+        # The corners share the inner's half; weights squared make the point itself move by it.
+        share = weights[at] / np.maximum((weights[at] ** 2).sum(1, keepdims=True), 1e-9)
+        moves = np.concatenate([0.5 * push, (-0.5 * share[..., None] * push[:, None]).reshape(-1, 3)])
+        self._scatter(vertices, moves)
+        moved = np.zeros(len(self.x), bool)
+        moved[vertices] = True
+        return moved
+
+    def _draw_apart(self, found: NDArray, number: int) -> NDArray:
+        """One step for each crossing edge and face; returns which vertices moved."""
+        edge, face = self.edges[found[:, 0]], self.faces[found[:, 1]]
+        p, q = self.x[edge[:, 0]], self.x[edge[:, 1]]
+        a, b, c = (self.x[face[:, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
+        over, under = ((p - a) * normal).sum(1), ((q - a) * normal).sum(1)
+        t = np.clip(over / np.where(np.abs(over - under) < 1e-15, 1.0, over - under), 0, 1)
+        at = p + t[:, None] * (q - p)
+        between = self.layer[edge[:, 0]] != self.layer[face[:, 0]]
+        move = np.where(
+            between[:, None],
+            self._by_order(edge, face, over, under, normal),
+            self._shorter_curve(found, p, q, normal, at, number),
+        )
+        on_edge = np.column_stack([1 - t, t])
+        on_face = _barycentric(at, a, b, c)
+        vertices = np.concatenate([edge.ravel(), face.ravel()])
+        moves = np.concatenate(
+            [
+                (0.5 * _share(on_edge)[..., None] * move[:, None]).reshape(-1, 3),
+                (-0.5 * _share(on_face)[..., None] * move[:, None]).reshape(-1, 3),
+            ]
+        )
+        self._scatter(vertices, moves)
+        moved = np.zeros(len(self.x), bool)
+        moved[vertices] = True
+        return moved
+
+    def _by_order(self, edge: NDArray, face: NDArray, over: NDArray, under: NDArray, normal: NDArray) -> NDArray:
+        """(K, 3) how the edge moves against the face so that the outer layer ends outside."""
+        outward = self.layer[edge[:, 0]] < self.layer[face[:, 0]]  # the edge belongs to the outer layer
+        # How far the edge reaches to its wrong side of the face.
+        depth = np.where(outward, -np.minimum(over, under), np.maximum(over, under))
+        depth = np.clip(depth, 0, 0.5 * self.scale) + self.settings.gap
+        return np.where(outward, depth, -depth)[:, None] * normal
+
+    def _shorter_curve(
+        self, found: NDArray, p: NDArray, q: NDArray, normal: NDArray, at: NDArray, number: int
+    ) -> NDArray:
+        """(K, 3) how the edge moves against the face so that the intersection curve shrinks."""
+        along = (q - p) / np.maximum(np.linalg.norm(q - p, axis=1, keepdims=True), 1e-15)
+        slope = (along * normal).sum(1)
+        slope = np.where(np.abs(slope) < 0.05, np.where(slope < 0, -0.05, 0.05), slope)
+        total = np.zeros_like(p)
+        for side in (0, 1):
+            mine = self.crossings.faces_of_edge[found[:, 0], side]
+            there = mine >= 0
+            corners = self.x[self.faces[mine]]
+            own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            line = np.cross(own, normal)
+            line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-15)
+            inward = (corners.mean(1) - at) - ((corners.mean(1) - at) * along).sum(1)[:, None] * along * 1.0
+            line *= np.where((line * inward).sum(1) < 0, -1.0, 1.0)[:, None]
+            step = line - (((along * line).sum(1) * 2.0 / slope)[:, None]) * normal
+            total += np.where(there[:, None], step, 0.0)
+        size = np.linalg.norm(total, axis=1, keepdims=True)
+        longest = self.settings.curve * self.scale
+        # A little of chance from round to round: equal and opposite steps would stand still for ever.
+        jitter = 1 + 0.5 * np.sin(1.7 * number + np.arange(len(p)))[:, None]
+        return total / np.maximum(size, 1e-9) * longest * jitter * np.minimum(size, 1.0)
+
+    def _relax(self, moved: NDArray, number: int) -> None:
+        """Edges near what moved go back towards the lengths that they came with."""
+        near = moved.copy()
+        for _ in range(4):
+            near[self.edges[near[self.edges].any(1)]] = True
+        mine = near[self.edges].all(1)
+        if not mine.any():
+            return
+        x = wp.array(self.x, dtype=wp.vec3d, device=DEVICE)
+        pair = wp.array(self.edges[mine].astype(np.int32), dtype=wp.vec2i, device=DEVICE)
+        length = wp.array(self.lengths[mine], dtype=wp.float64, device=DEVICE)
+        late = number / self.settings.rounds
+        stiffness = self.settings.stiffness * (1 - 0.8 * late)
+        wp.launch(_keep_lengths, 1, inputs=[x, pair, length, stiffness, self.settings.sweeps], device=DEVICE)
+        self.x = x.numpy().astype(np.float64)
+
+
+def _barycentric(at: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:
+    """(K, 3) weights of points in triangles."""
+    u, v, w = b - a, c - a, at - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    wu, wv = (w * u).sum(1), (w * v).sum(1)
+    det = np.maximum(uu * vv - uv * uv, 1e-30)
+    s, t = (vv * wu - uv * wv) / det, (uu * wv - uv * wu) / det
+    return np.clip(np.column_stack([1 - s - t, s, t]), 0, 1)
+
+
+def _share(weights: NDArray) -> NDArray:
+    """How much each corner moves so that the weighted point moves by one."""
+    return weights / np.maximum((weights**2).sum(1, keepdims=True), 1e-9)
