@@ -161,7 +161,9 @@ def _read_bvh(path: Path) -> Clip:
         for channel in joint.channels:
             axis = "XYZ".index(channel[0].upper())
             if channel.lower().endswith("rotation"):
-                local[:, k] = local[:, k] @ Rotation.from_euler("xyz"[axis], values[:, at], degrees=True).as_matrix()
+                local[:, k] = (
+                    local[:, k] @ Rotation.from_euler("xyz"[axis], values[:, at, None], degrees=True).as_matrix()
+                )
             elif k == 0:
                 root[:, axis] = values[:, at]
             at += 1
