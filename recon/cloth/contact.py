@@ -49,12 +49,13 @@ class BodyContact:
         Raises ``ValueError`` for points that are not finite or further than ``REACH`` away.
         """
         n = len(points)
+        if not n:
+            return torch.zeros(0, dtype=torch.long, device=points.device), points.new_zeros(0, 3), points.new_zeros(0)
         asked = wp.from_torch(points.detach().float().contiguous(), dtype=wp.vec3)
         face = wp.empty(n, dtype=int, device=self.device)
         weights = wp.empty(n, dtype=wp.vec3, device=self.device)
         sign = wp.empty(n, dtype=float, device=self.device)
-        if n:
-            wp.launch(_closest, n, inputs=[self.mesh.id, REACH, asked, face, weights, sign], device=self.device)
+        wp.launch(_closest, n, inputs=[self.mesh.id, REACH, asked, face, weights, sign], device=self.device)
         face = wp.to_torch(face).long()
         if (face < 0).any():
             raise ValueError(f"{int((face < 0).sum())} of {n} points are not within {REACH} m of the body")

@@ -124,6 +124,8 @@ class _Tangle:
         self.scale = float(self.lengths.mean())
         self.rims = self._rims()
         self.body = None
+        self.asked: NDArray | None = None
+        self.known = np.zeros(0)
         if body is not None:
             self.body = BodyContact(body.vertices.detach().cpu().double(), body.faces.cpu())
 
@@ -177,34 +179,52 @@ class _Tangle:
 
     def _lack(self) -> NDArray:
         """(V + F,) whether vertices and face centres are inside the body."""
-        if self.body is None:
-            return np.zeros(0, bool)
-        return self.body.signed_distance(self._points()).numpy() < 0
+        lack = np.zeros(len(self.x) + len(self.faces), bool)
+        if self.body is not None:
+            near, distance, _ = self._close_to_body(0.0)
+            lack[near[distance < 0]] = True
+        return lack
 
-    def _points(self) -> torch.Tensor:
-        return torch.from_numpy(np.concatenate([self.x, self.x[self.faces].mean(1)]))
+    def _close_to_body(self, wanted: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Of vertices and face centres, those that may be closer to the body than ``wanted`` [m].
+
+        Their rows (K,), signed distances (K,) and the directions away from the body (K, 3). A point that was far away
+        when it was last asked, and has not moved as far since, is not asked again.
+        """
+        assert self.body is not None
+        points = np.concatenate([self.x, self.x[self.faces].mean(1)])
+        if self.asked is None:
+            near = np.arange(len(points))
+            self.asked, self.known = points.copy(), np.zeros(len(points))
+        else:
+            near = np.flatnonzero(self.known - np.linalg.norm(points - self.asked, axis=1) < wanted)
+        at = torch.from_numpy(points[near]).requires_grad_()
+        distance = self.body.signed_distance(at)
+        (normal,) = torch.autograd.grad(distance.sum(), at)
+        found = distance.detach().numpy()
+        self.asked[near], self.known[near] = points[near], found
+        return near, found, normal.numpy()
 
     def _leave_body(self, number: int) -> NDArray:
         """Vertices and face centres closer to the body than the margin go out; returns which vertices moved."""
         moved = np.zeros(len(self.x), bool)
         if self.body is None:
             return moved
-        late = max(0.0, 2 * number / self.settings.rounds - 1)
+        n, late = len(self.x), max(0.0, 2 * number / self.settings.rounds - 1)
+        wanted = self.settings.body * (1 - 0.9 * late)
         for _ in range(3):
-            points = self._points().requires_grad_()
-            distance = self.body.signed_distance(points)
-            (normal,) = torch.autograd.grad(distance.sum(), points)
-            wanted = self.settings.body * (1 - 0.9 * late)
-            lack = np.maximum(wanted - distance.detach().numpy(), 0) * (1.05 + 3 * late)
+            near, distance, normal = self._close_to_body(wanted)
+            lack = np.maximum(wanted - distance, 0) * (1.05 + 3 * late)
             if not lack.any():
                 break
-            move = lack[:, None] * normal.numpy()
-            n = len(self.x)
-            self.x[lack[:n] > 0] += move[:n][lack[:n] > 0]
-            at = np.flatnonzero(lack[n:])
-            self._scatter(self.faces[at].ravel(), np.repeat(move[n:][at], 3, 0))
-            moved[lack[:n] > 0] = True
-            moved[self.faces[at].ravel()] = True
+            move = lack[:, None] * normal
+            own = (near < n) & (lack > 0)
+            self.x[near[own]] += move[own]
+            by_face = (near >= n) & (lack > 0)
+            corners = self.faces[near[by_face] - n].ravel()
+            self._scatter(corners, np.repeat(move[by_face], 3, 0))
+            moved[near[own]] = True
+            moved[corners] = True
         return moved
 
     def _scatter(self, vertices: NDArray, moves: NDArray) -> None:
