@@ -20,6 +20,7 @@ from pipelines.garment_source import load_garment
 from pipelines.training import Budget, Training
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import mirrored, motion_of
+from recon.bodies.rig import JOINT_NAMES
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, inertia, towards_template
 from recon.cloth.frames import FramePhysics, FrameWeights
@@ -32,6 +33,10 @@ from recon.garments import WAISTED
 from recon.garments.panels import border_loops, waistband
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
 
+ARMS = torch.tensor(
+    [any(part in name for part in ("collar", "shoulder", "elbow", "wrist", "hand")) for name in JOINT_NAMES]
+)
+"""(24,) which joints are the arms'."""
 FAR = 0.1
 """Distance from the body at which an edge keeps the template's fold entirely (alpha of Eq. 12) [m]."""
 
@@ -62,6 +67,8 @@ class TrainGaps:
     """Windows of motion per step, each on a body of its own."""
     frames: int = 3
     """Frames of a window."""
+    burn_in: int = 24
+    """Frames before it that only bring the hidden state where it is in the midst of a motion."""
     fps: float = 30.0
     """Frames per second."""
     shape_spread: float = 0.7
@@ -72,11 +79,11 @@ class TrainGaps:
     """Units of each GRU layer."""
     layers: int = 4
     """GRU layers."""
-    modes: int = 500
+    modes: int = 800
     """Smoothest functions on the garment that displacements are learned in."""
     skinning: str = "rbf"
     """How the garment rides on the body: rbf, gaps, nearest, k_nearest or smoothed."""
-    inextensibility: float = 2.5e-5
+    inextensibility: float = 1e-4
     """Strength of Eq. 15 per vertex [J]; 0 = without."""
     relax: bool = True
     """Let the stretch factor out where cloth collides (Eq. 16); False holds it at 1."""
@@ -181,33 +188,45 @@ class Loss:
         rest = Mesh(body.rest(body.neutral().shape).vertices[0], body.faces)
         self.physics = FramePhysics(template.cloth, rings, rest, weights, config.windows * config.frames)
 
-    def windows(self, generator: torch.Generator) -> tuple[BodyPose, Tensor]:
-        """Random windows as bodies (windows * frames) and what the network sees (windows, frames, FEATURES)."""
+    def windows(self, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Random windows of motion, each with the frames before it: pose (W, B + F + 1, 24, 3), translation likewise.
+
+        In every other one the arms move as in another clip: a dozen clips hold few combinations.
+        """
         c = self.config
-        lengths = torch.tensor([len(m.pose) - c.frames for m in self.motions]).clamp_min(1)
-        picked = torch.multinomial(lengths.float(), c.windows, replacement=True, generator=generator)
+        length = c.burn_in + c.frames + 1
+        legs, arms = (self._pick(c.windows, length, generator) for _ in range(2))
+        swap = torch.rand(c.windows, generator=generator) < 0.5
+        return torch.where(swap[:, None, None, None] & ARMS[:, None], arms[0], legs[0]), legs[1]
+
+    def _pick(self, count: int, length: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """``count`` random stretches of motion: pose (count, length, 24, 3) and translation (count, length, 3)."""
+        lengths = torch.tensor([len(m.pose) for m in self.motions])
         poses, places = [], []
-        for k in picked.tolist():
+        for k in torch.multinomial(lengths.float(), count, replacement=True, generator=generator).tolist():
             motion = self.motions[k]
-            at = int(torch.randint(int(lengths[k]), (), generator=generator))
-            rows = torch.arange(at, at + c.frames + 1).clamp(max=len(motion.pose) - 1)
+            last = int(torch.randint(int(lengths[k]), (), generator=generator))
+            rows = torch.arange(last - length + 1, last + 1).clamp(min=0)  # before the clip begins people stand still
             poses.append(motion.pose[rows])
             places.append(motion.translation[rows])
-        pose, place = torch.stack(poses), torch.stack(places)
-        features = motion_features(pose[:, 1:], place[:, 1:], c.fps, (pose[:, 0], place[:, 0]))
-        shape = torch.randn(c.windows, self.body.n_shape, generator=generator).clamp(-2, 2) * c.shape_spread
-        many = shape.repeat_interleave(c.frames, 0)
-        return BodyPose(many, pose[:, 1:].flatten(0, 1), place[:, 1:].flatten(0, 1)), features
+        return torch.stack(poses), torch.stack(places)
 
     def __call__(self, net: GapsNet, share: float, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """The loss of one random batch, and its terms per frame."""
         c = self.config
-        pose, features = self.windows(generator)
+        pose, place = self.windows(generator)
+        features = motion_features(pose[:, 1:], place[:, 1:], c.fps, (pose[:, 0], place[:, 0]))
+        shape = torch.randn(c.windows, self.body.n_shape, generator=generator).clamp(-2, 2) * c.shape_spread
+        hidden = None
+        if c.burn_in:  # hidden states as they are in the midst of a motion
+            with torch.no_grad():
+                hidden = net.remember(features[:, : c.burn_in], shape)[1]
+        moved, _ = net(features[:, c.burn_in :], shape, hidden)
+        many = shape.repeat_interleave(c.frames, 0)
+        last = slice(-c.frames, None)
         with torch.no_grad():
-            body = self.body.pose(pose)
-        hidden = 0.1 * torch.randn(c.layers, c.windows, c.width, generator=generator)
-        moved, _ = net(features, pose.shape[:: c.frames], hidden)
-        x = self.bound.place(moved.flatten(0, 1), body.transforms, pose.shape)
+            body = self.body.pose(BodyPose(many, pose[:, last].flatten(0, 1), place[:, last].flatten(0, 1)))
+        x = self.bound.place(moved.flatten(0, 1), body.transforms, many)
         energy, terms = self.physics(x, body.mesh.vertices, epoch=100 * min(1.0, 2 * share))
         path = x.unflatten(0, (c.windows, c.frames))
         swung = inertia(self.template.cloth, path[:, 2:], path[:, 1:-1], path[:, :-2], 1 / c.fps).sum(1)

@@ -44,7 +44,8 @@ class FrameWeights:
     inextensibility: float = 2.5e-5
     """Strength of Eq. 15 per vertex, see ``inextensible`` [J]; 0 leaves it out."""
     relax: bool = True
-    """Whether k_ext follows Eq. 16; False keeps it at 1."""
+    """Whether k_ext follows Eq. 16; False keeps it at 1. Cloth at rest on the skin keeps the margin only just: what
+    counts for Eq. 16 is how deep it is inside the body itself."""
 
 
 @wp.struct
@@ -173,7 +174,8 @@ def _evaluate(
             if r.size[i] > wp.float64(0.0):
                 factor = wp.float64(1.0)
                 if r.epoch > wp.float64(0.0):
-                    factor += wp.min(wp.float64(10.0) * depths[first + i], wp.float64(0.03)) * r.epoch
+                    inside = wp.max(depths[first + i] - touch.margin, wp.float64(0.0))
+                    factor += wp.min(wp.float64(10.0) * inside, wp.float64(0.03)) * r.epoch
                 inext += _ring(x, g, r, i, first, factor)
     terms[b, 0] = strain
     terms[b, 1] = bending

@@ -8,15 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
-from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings
+from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, edge_laplacian, springs
 from recon.cloth.xpbd import ON_BORDER, Constraints, close_strangers, open_rim
 
 LAYER_REACH = 0.02
@@ -53,7 +51,7 @@ class LayeredCloth:
         self.starts = np.cumsum([0, *[len(c.masses) for c in cloths]])
         self.cloth = stack(cloths)
         self.energy = ElasticEnergy(self.cloth)
-        self.laplacian = _laplacian(self.cloth)
+        self.laplacian = edge_laplacian(self.cloth)
         self.levels: list[NDArray] = []
         self.touching = np.zeros(self.starts[-1])
 
@@ -90,10 +88,7 @@ class LayeredCloth:
         It lets L-BFGS start where the stiffness is (Liu et al. 2017, "Quasi-Newton Methods for Real-Time Simulation
         of Hyperelastic Materials").
         """
-        fabric = self.cloth.fabric
-        spring = fabric.thickness * (2 * fabric.lame_mu + fabric.lame_lambda)
-        diagonal = 2 * self.settings.stiffness * self.touching + 0.02 * spring
-        return splu((spring * self.laplacian + sp.diags(diagonal)).tocsc()).solve
+        return springs(self.cloth, self.laplacian, 2 * self.settings.stiffness * self.touching)
 
     def _body(self, x: NDArray) -> Contacts:
         """Planes of the body close to the cloth."""
@@ -156,12 +151,3 @@ def _vertex_normals(x: NDArray, faces: NDArray) -> NDArray:
     for k in range(3):
         np.add.at(out, faces[:, k], normals)
     return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
-
-
-def _laplacian(cloth: Cloth) -> sp.csr_matrix:
-    """(V, V) combinatorial Laplacian of the cloth's edges."""
-    edges, count = cloth.edges.numpy(), len(cloth.masses)
-    ones = np.ones(len(edges))
-    half = sp.coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(count, count))
-    both = (half + half.T).tocsr()
-    return sp.diags(np.asarray(both.sum(1)).ravel()) - both

@@ -10,8 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
 
 from recon.cloth.contact import BodyContact
 from recon.cloth.elastic import Elastic, elastic, hinge, membrane
@@ -205,6 +207,21 @@ def _holds(x: NDArray, limits: Constraints, level: float, s: PolishSettings):
         yield Contacts(vertex=legs, point=normal * (s.middle - s.offset), normal=normal)
 
 
+def edge_laplacian(cloth: Cloth) -> sp.csr_matrix:
+    """(V, V) combinatorial Laplacian of the cloth's edges."""
+    edges, count = cloth.edges.numpy(), len(cloth.masses)
+    half = sp.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    both = (half + half.T).tocsr()
+    return sp.diags(np.asarray(both.sum(1)).ravel()) - both
+
+
+def springs(cloth: Cloth, laplacian: sp.csr_matrix, diagonal: NDArray) -> Callable[[NDArray], NDArray]:
+    """Multiplies (V, 3) by the inverse of a stand-in for the Hessian: springs along edges, ``diagonal`` (V,) [N/m]."""
+    fabric = cloth.fabric
+    spring = fabric.thickness * (2 * fabric.lame_mu + fabric.lame_lambda)
+    return splu((spring * laplacian + sp.diags(diagonal + 0.02 * spring)).tocsc()).solve
+
+
 def lbfgs(
     function: Callable[[NDArray], tuple[float, NDArray]],
     x: NDArray,
@@ -212,6 +229,7 @@ def lbfgs(
     memory: int = 10,
     precondition: Callable[[NDArray], NDArray] | None = None,
     longest: float = 0.005,
+    tolerance: float = 0.0,
 ) -> NDArray:
     """Minimise by L-BFGS with backtracking (Nocedal & Wright, algorithms 7.4, 3.1); never ends higher than it began.
 
@@ -222,10 +240,13 @@ def lbfgs(
         memory: pairs kept.
         precondition: multiplies by an inverse stand-in for the Hessian; without it, a multiple of the identity.
         longest: with ``precondition``, no entry of x moves further than this in one step.
+        tolerance: stop when no entry of the gradient is larger than this.
     """
     value, gradient = function(x)
     steps: list[tuple[NDArray, NDArray, float]] = []
     for _ in range(iterations):
+        if np.abs(gradient).max(initial=0.0) <= tolerance:
+            break
         direction = -_two_loops(gradient, steps, precondition)
         slope = float((direction * gradient).sum())
         if slope >= 0:

@@ -31,7 +31,7 @@ PANELS = ("panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
 """Index tensors of a garment's panels, as stored."""
 COARSE = 150.0
 """Laplacian eigenvalue [1/m²] of waves half a metre long: as smooth as cloth on a body mostly is."""
-WARM_UP = 8
+WARM_UP = 24
 """Frames for which the first pose is held before a motion starts: the hidden state settles."""
 
 
@@ -62,10 +62,14 @@ class GapsNet(nn.Module):
         nn.init.normal_(self.out.weight, 0.0, 0.01)
         nn.init.zeros_(self.out.bias)
 
-    def forward(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Features (B, T, FEATURES), shape (B, S), hidden (L, B, W) -> displacements (B, T, V, 3) [m], hidden."""
+    def remember(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Features (B, T, FEATURES), shape (B, S), hidden (L, B, W) -> states (B, T, W), hidden after them."""
         both = torch.cat([features, shape[:, None].expand(-1, features.shape[1], -1)], -1)
-        states, hidden = self.gru(both, hidden)
+        return self.gru(both, hidden)
+
+    def forward(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """As ``remember`` -> displacements (B, T, V, 3) [m], hidden."""
+        states, hidden = self.remember(features, shape, hidden)
         moved = self.out(states).unflatten(-1, (-1, 3))
         return self.shape.scale * (moved if self.basis is None else self.basis @ moved), hidden
 
@@ -177,7 +181,7 @@ class GapsDraper:
         """The hidden state of a body that has stood still in its first pose."""
         still = first.clone()
         still[..., -6:] = 0
-        return self.net(still.expand(-1, WARM_UP, -1), shape)[1]
+        return self.net.remember(still.expand(-1, WARM_UP, -1), shape)[1]
 
 
 def load_gaps(name: str, body, folder: str | Path | None = None) -> GapsDraper:

@@ -52,7 +52,7 @@ def trained(tmp_path_factory, motions: Path) -> tuple[Path, TrainGaps]:
     out = tmp_path_factory.mktemp("gaps")
     config = TrainGaps(
         "skirt:test:1", motions, name="mini", holdout=("march",), out=out, steps=6, threads=1, windows=2, width=32,
-        layers=2, modes=40,
+        layers=2, modes=40, burn_in=3,
     )  # fmt: skip
     train_gaps(config)
     return out, config

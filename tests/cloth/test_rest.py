@@ -1,0 +1,66 @@
+"""Cloth at rest: a closed form, refinement, contact, pins, and an energy that only falls."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from sheets import sheet
+
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import GRAVITY, Cloth, Fabric
+from recon.cloth.rest import Resting, rest
+
+
+def hanging(cells: int) -> tuple[Cloth, np.ndarray, np.ndarray]:
+    """A square held at two corners that are a little closer than it is wide."""
+    made = sheet(cells, cells, 1.0, 1.0)
+    x = made.mesh.vertices.numpy().copy()
+    pins = np.flatnonzero((x[:, 1] > 1 - 1e-9) & ((x[:, 0] < 1e-9) | (x[:, 0] > 1 - 1e-9)))
+    x[:, 2] += 0.01 * np.sin(7 * x[:, 0]) * (1 - x[:, 1])
+    x[pins, 0] += np.where(x[pins, 0] < 0.5, 0.1, -0.1)
+    return Cloth.from_garment(made), x, pins
+
+
+def test_a_hanging_strip_has_the_closed_form() -> None:
+    """Without cross contraction every height s carries the weight below: Y lambda (lambda² - 1) / 2 = w s."""
+    made = sheet(4, 16, 0.25, 1.0)
+    fabric = Fabric(lame_lambda=0.0)
+    x = made.mesh.vertices.numpy()
+    found = rest(Cloth.from_garment(made, fabric), x, np.flatnonzero(x[:, 1] > 1 - 1e-9))
+    modulus, weight = 2 * fabric.lame_mu * fabric.thickness, fabric.density * fabric.thickness * GRAVITY
+    heights = np.linspace(0, 1, 1001)
+    stretch = np.array([max(np.roots([modulus / 2, 0, -modulus / 2, -weight * s]).real) for s in heights])
+    length = float(((stretch[1:] + stretch[:-1]) / 2).mean())
+    assert found.converged and length > 1.03
+    assert 1 - found.x[:, 1].min() == pytest.approx(length, rel=1e-3)
+
+
+def test_pins_stay_and_energy_falls() -> None:
+    cloth, x, pins = hanging(12)
+    found = rest(cloth, x, pins, settings=Resting(search=50))
+    assert found.converged and found.residual <= 0.02
+    assert np.array_equal(found.x[pins], x[pins])
+    assert all(b <= a for a, b in zip(found.energies, found.energies[1:]))
+    assert found.energy < found.energies[0] - 0.1
+    assert found.x[:, 1].min() < -0.08  # it sags
+
+
+def test_stopping_early_is_told() -> None:
+    cloth, x, pins = hanging(12)
+    assert not rest(cloth, x, pins, settings=Resting(iterations=5)).converged
+
+
+def test_cloth_on_a_ball_stays_outside_and_hangs() -> None:
+    made = sheet(24, 24, 0.7, 0.7)
+    flat = made.mesh.vertices.numpy()
+    x = np.column_stack([flat[:, 0] - 0.35, np.full(len(flat), 0.206), flat[:, 1] - 0.35])
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.2)
+    body = BodyContact(torch.as_tensor(np.array(ball.vertices)), torch.as_tensor(np.array(ball.faces)))
+    found = rest(Cloth.from_garment(made), x, body=body, settings=Resting(iterations=1500, tolerance=0.2))
+    away = np.linalg.norm(found.x, axis=1)
+    assert away.min() > 0.2 and found.x[:, 1].min() < -0.02
+    assert found.energy < found.energies[0]
+    middle = np.abs(flat[:, :2] - 0.35).sum(1).argmin()
+    assert found.x[middle, 1] == pytest.approx(0.2035, abs=2e-3)  # it lies on top
