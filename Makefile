@@ -8,6 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null && { echo $$p; break; }; done)
 WORKERS ?= 2
 DEMO_OUT ?= out/demo
+NOTEBOOKS := $(notdir $(basename $(wildcard notebooks/*.py)))
 
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
@@ -47,8 +48,9 @@ unit: $(VENV)/.installed-dev
 
 notebook: $(VENV)/.installed-dev
 	mkdir -p out
-	$(VENV)/bin/jupytext --quiet --to ipynb --output out/01_fit_photo.ipynb notebooks/01_fit_photo.py
-	GARMENT_RECON_NOTEBOOK=quick $(VENV)/bin/python -m pytest -q -p no:cacheprovider --nbmake --nbmake-timeout 900 out/01_fit_photo.ipynb
+	for n in $(NOTEBOOKS); do $(VENV)/bin/jupytext --quiet --to ipynb --output out/$$n.ipynb notebooks/$$n.py; done
+	GARMENT_RECON_NOTEBOOK=quick $(VENV)/bin/python -m pytest -q -p no:cacheprovider --nbmake --nbmake-timeout 900 \
+		$(NOTEBOOKS:%=out/%.ipynb)
 
 clean:
 	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -12,10 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from recon.cloth.constraints import Constraints, close_strangers, open_rim
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
 from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, edge_laplacian, springs
-from recon.cloth.xpbd import ON_BORDER, Constraints, close_strangers, open_rim
+from recon.cloth.xpbd import ON_BORDER
 
 LAYER_REACH = 0.02
 """Layers further apart than this, or deeper in each other, don't touch [m]."""

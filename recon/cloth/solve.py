@@ -15,10 +15,10 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from recon.cloth.constraints import Constraints, close_strangers, held_height
 from recon.cloth.contact import BodyContact
 from recon.cloth.elastic import Elastic, elastic, hinge, membrane
 from recon.cloth.energies import Cloth
-from recon.cloth.xpbd import Constraints, close_strangers, held_height
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})

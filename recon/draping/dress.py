@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 from recon.bodies import Body
+from recon.cloth.constraints import Constraints
 from recon.cloth.energies import Cloth
-from recon.cloth.xpbd import Carry, Constraints, Settings, carry
+from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping import Draper
 from recon.garments import WAISTED
 from recon.garments.panels import waistband

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from recon.cloth.constraints import Constraints
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, Fabric, stretch
 from recon.cloth.intersections import self_intersections
 from recon.cloth.solve import polish
-from recon.cloth.xpbd import Constraints, body_mesh, settle
+from recon.cloth.xpbd import body_mesh, settle
 from recon.garments.patterns import Pattern, weld
 from recon.garments.patterns_body import Measures
 from recon.garments.patterns_place import BodyRelief

@@ -10,11 +10,11 @@ import torch
 import trimesh
 from sheets import sheet
 
+from recon.cloth.constraints import Constraints
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import GRAVITY, Cloth, Fabric
 from recon.cloth.layers import LayeredCloth, stack
 from recon.cloth.solve import ElasticEnergy, PolishSettings, lbfgs
-from recon.cloth.xpbd import Constraints
 from recon.types import Garment
 
 SETTINGS = PolishSettings(apart=0.5)

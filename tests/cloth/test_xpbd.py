@@ -8,10 +8,11 @@ import torch
 import trimesh
 from sheets import sheet
 
+from recon.cloth.constraints import Constraints, close_strangers
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stretch
 from recon.cloth.solve import polish
-from recon.cloth.xpbd import Carry, Constraints, Settings, body_mesh, carry, close_strangers, settle
+from recon.cloth.xpbd import Carry, Settings, body_mesh, carry, settle
 from recon.garments.panels import waistband
 from tests.garments.synthetic import tube
 

@@ -10,9 +10,9 @@ import torch
 
 from recon.bodies import load_body
 from recon.bodies.poses import a_pose
+from recon.cloth.constraints import open_rim
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stretch
-from recon.cloth.xpbd import open_rim
 from recon.draping.dress import Dressing, dress, limits_of, neutral
 from recon.draping.skinning import SkinningDraper
 from recon.garments.dataset import load_garments
