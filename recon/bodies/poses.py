@@ -35,7 +35,7 @@ def stroll(seconds: float = 3.0, fps: float = 30.0) -> Motion:
         pose[:, JOINT_NAMES.index(side + "knee"), 0] = 0.25 + 0.35 * torch.sin(
             beat + (0 if sign > 0 else math.pi) - 1.9
         )
-        pose[:, JOINT_NAMES.index(side + "shoulder"), 1] = 0.3 * swing
+        pose[:, JOINT_NAMES.index(side + "shoulder"), 1] = 0.3 * torch.sin(beat)  # each arm against its leg
         pose[:, JOINT_NAMES.index(side + "elbow"), 1] = -sign * (0.35 + 0.15 * swing)
     pose[:, JOINT_NAMES.index("spine2"), 1] = 0.08 * torch.sin(beat)
     place = torch.zeros(len(t), 3)
