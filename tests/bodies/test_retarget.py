@@ -111,3 +111,17 @@ def test_other_frame_rates_meet_the_old_ones(body) -> None:
 def test_mirrored_twice_is_the_same(joints: np.ndarray) -> None:
     pose = retarget(clip(random_local(3)), joints)
     np.testing.assert_allclose(mirrored(mirrored(pose)), pose)
+
+
+def test_the_made_walk_walks(body) -> None:
+    from recon.bodies.pose_prior import limit_energy
+    from recon.bodies.poses import stroll
+
+    motion = stroll(1.2)
+    with torch.no_grad():
+        joints = body.pose(motion.body(body.neutral().shape)).joints
+    assert motion.pose.shape == (36, 24, 3) and float(limit_energy(motion.pose).max()) == 0
+    left, right = (joints[:, JOINT_NAMES.index(n)] for n in ("l_ankle", "r_ankle"))
+    hands = [joints[:, JOINT_NAMES.index(n)] for n in ("l_wrist", "r_wrist")]
+    legs, arms = (left - right)[:, 2], (hands[0] - hands[1])[:, 2]
+    assert legs.abs().max() > 0.3 and float((legs * arms).mean()) < 0  # each arm goes with the other leg
