@@ -2,8 +2,8 @@
 
 The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
 simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
-overlap, all layers at once. In between the panels are graded again, to the cloth as the photo shows it. Ends with no
-vertex and no face centre inside the body.
+overlap, all layers at once. In between the panels are graded again, to the cloth as the photo shows it. Last, what
+passes through itself or another layer is drawn apart. Ends with no vertex and no face centre inside the body.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, Fabric
 from recon.cloth.layers import LayeredCloth
 from recon.cloth.solve import PolishSettings, lbfgs
+from recon.cloth.untangle import Untangling, untangle
 from recon.draping.dress import Dressing, dress, limits_of, neutral
 from recon.garments.grading import grade
 from recon.losses import soft_iou_loss
@@ -56,6 +57,8 @@ class Refinement:
     """Body and layers are in each other's way within this distance [m]."""
     margin: float = 5e-4
     """Distance from the body that every vertex and face centre ends with [m]."""
+    untangling: int = 60
+    """Most rounds of drawing apart what passes through itself or another layer; 0 = without."""
 
 
 @dataclass(frozen=True)
@@ -190,9 +193,18 @@ def refine(
         garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, parts)]
         parts = match(parts, garments, body, evidence, settings, tick)
     layers = [replace(layer, garment=g) for layer, g in zip(layers, garments)]
-    contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
-    meshes = {}
-    for layer, part, f in zip(layers, parts, faces):
-        free = torch.from_numpy(part).to(device, torch.float32)
-        meshes[layer.name] = Mesh(push_out(free, f, contact, settings.margin), f)
-    return Refined([to_device(layer, device) for layer in layers], meshes)
+    meshes = drawn_apart(parts, [layer.garment.mesh.faces for layer in layers], body, settings)
+    named = {layer.name: Mesh(m.vertices.to(device), f) for layer, m, f in zip(layers, meshes, faces)}
+    return Refined([to_device(layer, device) for layer in layers], named)
+
+
+def drawn_apart(parts: list[NDArray], faces: list[Tensor], body: BodyContact, settings: Refinement) -> list[Mesh]:
+    """The layers (V, 3) out of the body, and out of each other as far as there is room; on the CPU."""
+
+    def out(x: NDArray, f: Tensor) -> Mesh:
+        return Mesh(push_out(torch.from_numpy(x).float(), f, body, settings.margin), f)
+
+    meshes = [out(x, f) for x, f in zip(parts, faces)]
+    how = Untangling(rounds=settings.untangling, body=settings.margin)
+    done = untangle(meshes, Mesh(body.vertices, body.faces), how)
+    return [out(x, f) for x, f in zip(done.vertices, faces)]

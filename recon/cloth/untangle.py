@@ -19,16 +19,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 
 from recon.cloth.contact import BodyContact
 from recon.cloth.intersections import Crossings
+from recon.cloth.xpbd import keep_lengths
 from recon.types import Mesh
 
-wp.set_module_options({"enable_backward": False})
-
-DEVICE = "cpu"
+WORSE = 2.0
+"""So many times as many crossings as at best mean that steps are too long."""
+CALMEST = 0.1
+"""Where steps had to be made shorter than this share, there is no way out."""
 
 
 @dataclass(frozen=True)
@@ -74,25 +75,6 @@ class Untangled:
         return not len(self.left) and not self.inside
 
 
-@wp.kernel
-def _keep_lengths(
-    x: wp.array(dtype=wp.vec3d),
-    pair: wp.array(dtype=wp.vec2i),
-    length: wp.array(dtype=wp.float64),
-    stiffness: wp.float64,
-    sweeps: int,
-):
-    for _s in range(sweeps):
-        for k in range(pair.shape[0]):
-            p = pair[k]
-            d = x[p[0]] - x[p[1]]
-            now = wp.length(d)
-            if now > wp.float64(1.0e-9):
-                move = d * (wp.float64(0.5) * stiffness * (length[k] - now) / now)
-                x[p[0]] = x[p[0]] + move
-                x[p[1]] = x[p[1]] - move
-
-
 def untangle(layers: Sequence[Mesh], body: Mesh | None = None, settings: Untangling | None = None) -> Untangled:
     """Draw apart what passes through each other.
 
@@ -125,6 +107,7 @@ class _Tangle:
         self.rims = self._rims()
         self.body = None
         self.asked: NDArray | None = None
+        self.temper = 1.0  # factor on the steps against the curve
         self.known = np.zeros(0)
         if body is not None:
             self.body = BodyContact(body.vertices.detach().cpu().double(), body.faces.cpu())
@@ -137,32 +120,40 @@ class _Tangle:
         return rim
 
     def solve(self) -> Untangled:
+        """Rounds until nothing is left; where it grows worse, back to the best so far with smaller steps."""
         s = self.settings
-        found = self.crossings(self.x)
+        found, lack = self.crossings(self.x), self._lack()
         before = len(self.crossings.pairs(found))
-        lack = self._lack()
-        rounds = 0
-        while (len(found) or lack.any()) and rounds < s.rounds:
-            moved = np.zeros(len(self.x), bool)
-            if len(found):
-                if len(self.starts) > 2 and rounds % 4 == 0:
-                    moved |= self._back_to_own_side()
-                    found = self.crossings(self.x)
-                moved |= self._draw_apart(found, rounds)
-            moved |= self._leave_body(rounds)
-            self._relax(moved, rounds)
-            self._leave_body(rounds)
+        best, best_x, rounds = (int(lack.sum()), len(found)), self.x.copy(), 0
+        while any(best) and rounds < s.rounds and self.temper > CALMEST:
+            self._round(found, rounds)
             found, lack = self.crossings(self.x), self._lack()
             rounds += 1
+            now = int(lack.sum()), len(found)
+            if now < best:
+                best, best_x, self.temper = now, self.x.copy(), min(1.0, 1.15 * self.temper)
+            elif len(found) > WORSE * best[1] + 50:
+                self.x, self.temper = best_x.copy(), self.temper * 0.7
+                found = self.crossings(self.x)
+        if best_x is not self.x:
+            self.x = best_x
+            found, lack = self.crossings(self.x), self._lack()
         left = self.crossings.pairs(found)
-        return Untangled(
-            [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])],
-            before,
-            left,
-            int(lack.sum()),
-            rounds,
-            self._notes(left, int(lack.sum())),
-        )
+        layers = [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
+        inside = int(lack.sum())
+        return Untangled(layers, before, left, inside, rounds, self._notes(left, inside))
+
+    def _round(self, found: NDArray, number: int) -> None:
+        """One round of small moves, for the crossings ``found`` (K, 2)."""
+        moved = np.zeros(len(self.x), bool)
+        if len(found):
+            if len(self.starts) > 2 and number % 4 == 0:
+                moved |= self._back_to_own_side()
+                found = self.crossings(self.x)
+            moved |= self._draw_apart(found, number)
+        moved |= self._leave_body(number)
+        self._relax(moved, number)
+        self._leave_body(number, 10)
 
     def _notes(self, left: NDArray, inside: int) -> tuple[str, ...]:
         lines = []
@@ -205,14 +196,14 @@ class _Tangle:
         self.asked[near], self.known[near] = points[near], found
         return near, found, normal.numpy()
 
-    def _leave_body(self, number: int) -> NDArray:
+    def _leave_body(self, number: int, times: int = 3) -> NDArray:
         """Vertices and face centres closer to the body than the margin go out; returns which vertices moved."""
         moved = np.zeros(len(self.x), bool)
         if self.body is None:
             return moved
         n, late = len(self.x), max(0.0, 2 * number / self.settings.rounds - 1)
         wanted = self.settings.body * (1 - 0.9 * late)
-        for _ in range(3):
+        for _ in range(times):
             near, distance, normal = self._close_to_body(wanted)
             lack = np.maximum(wanted - distance, 0) * (1.05 + 3 * late)
             if not lack.any():
@@ -321,7 +312,7 @@ class _Tangle:
             step = line - (((along * line).sum(1) * 2.0 / slope)[:, None]) * normal
             total += np.where(there[:, None], step, 0.0)
         size = np.linalg.norm(total, axis=1, keepdims=True)
-        longest = self.settings.curve * self.scale
+        longest = self.temper * self.settings.curve * self.scale
         # A little of chance from round to round: equal and opposite steps would stand still for ever.
         jitter = 1 + 0.5 * np.sin(1.7 * number + np.arange(len(p)))[:, None]
         return total / np.maximum(size, 1e-9) * longest * jitter * np.minimum(size, 1.0)
@@ -334,13 +325,8 @@ class _Tangle:
         mine = near[self.edges].all(1)
         if not mine.any():
             return
-        x = wp.array(self.x, dtype=wp.vec3d, device=DEVICE)
-        pair = wp.array(self.edges[mine].astype(np.int32), dtype=wp.vec2i, device=DEVICE)
-        length = wp.array(self.lengths[mine], dtype=wp.float64, device=DEVICE)
-        late = number / self.settings.rounds
-        stiffness = self.settings.stiffness * (1 - 0.8 * late)
-        wp.launch(_keep_lengths, 1, inputs=[x, pair, length, stiffness, self.settings.sweeps], device=DEVICE)
-        self.x = x.numpy().astype(np.float64)
+        stiffness = self.settings.stiffness * (1 - 0.8 * number / self.settings.rounds)
+        self.x = keep_lengths(self.x, self.edges[mine], self.lengths[mine], stiffness, self.settings.sweeps)
 
 
 def _barycentric(at: NDArray, a: NDArray, b: NDArray, c: NDArray) -> NDArray:

@@ -295,3 +295,31 @@ def _allocate(start: NDArray, constraints: Constraints, s: Settings) -> tuple[_C
     cloth.near = wp.zeros(20 * n, dtype=wp.vec2i, device=DEVICE)
     cloth.near_length = wp.zeros(20 * n, dtype=float, device=DEVICE)
     return cloth, len(pair)
+
+
+@wp.kernel
+def _keep_lengths(
+    x: wp.array(dtype=wp.vec3d),
+    pair: wp.array(dtype=wp.vec2i),
+    length: wp.array(dtype=wp.float64),
+    stiffness: wp.float64,
+    sweeps: int,
+):
+    for _s in range(sweeps):
+        for k in range(pair.shape[0]):
+            p = pair[k]
+            d = x[p[0]] - x[p[1]]
+            now = wp.length(d)
+            if now > wp.float64(1.0e-9):
+                move = d * (wp.float64(0.5) * stiffness * (length[k] - now) / now)
+                x[p[0]] = x[p[0]] + move
+                x[p[1]] = x[p[1]] - move
+
+
+def keep_lengths(x: NDArray, pairs: NDArray, lengths: NDArray, stiffness: float, sweeps: int) -> NDArray:
+    """(V, 3) vertices after ``sweeps`` over ``pairs`` (E, 2), each giving back a share of its error in length."""
+    moved = wp.array(np.ascontiguousarray(x, np.float64), dtype=wp.vec3d, device=DEVICE)
+    pair = wp.array(pairs.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
+    length = wp.array(np.ascontiguousarray(lengths, np.float64), dtype=wp.float64, device=DEVICE)
+    wp.launch(_keep_lengths, 1, inputs=[moved, pair, length, stiffness, sweeps], device=DEVICE)
+    return moved.numpy().astype(np.float64)
