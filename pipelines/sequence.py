@@ -20,7 +20,7 @@ from pipelines.garment_source import load_garment
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
-from recon.cloth.untangle import untangle
+from recon.cloth.untangle import Untangling, untangle
 from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping.dress import limits_of
 from recon.draping.gaps import load_gaps
@@ -36,6 +36,8 @@ DRAPERS = ("gaps", "simulate", "skinning")
 WRITERS = ("glb", "obj", "pc2", "gif", "mp4")
 SKIN = (0.86, 0.69, 0.58)
 COLOURS = ((0.27, 0.51, 0.76), (0.80, 0.42, 0.36), (0.38, 0.62, 0.43), (0.72, 0.55, 0.80))
+ROUNDS = 40
+"""Most rounds of untangling per frame: what has no room in one frame mostly has none in the next."""
 LEAD_IN = 24
 """Frames in which a simulated garment goes from the T pose to the motion's first."""
 
@@ -206,7 +208,7 @@ def untangled(worn: Sequence[Moving], posed: PosedBody, body: Body) -> tuple[lis
     clean, crossings, notes = 0, 0, []
     for k in range(len(posed.mesh.vertices)):
         layers = [Mesh(part.frames[k], part.faces) for part in worn]
-        done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces))
+        done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces), Untangling(rounds=ROUNDS))
         clean += done.clean
         crossings += done.crossings
         notes += [f"frame {k}: {note}" for note in done.notes]

@@ -250,7 +250,7 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         "what": f"GAPS draping network of the garment {config.garment}",
         "shape": asdict(net.shape),
         "skinning": config.skinning,
-        "data": f"motion clips of the folder {config.motions.name} and their mirror images; held out: {', '.join(config.holdout)}",
+        "data": f"motion clips of {config.motions.name} and their mirror images; held out: {', '.join(config.holdout)}",
         "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
         "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions")},
         "seed": config.seed,
