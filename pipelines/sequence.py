@@ -41,8 +41,6 @@ ROUNDS = 40
 LEAD_IN = 24
 """Frames in which a simulated garment goes from the T pose to the motion's first."""
 
-Tick = Callable[[int, float], None]
-
 
 @dataclass(frozen=True)
 class Animate:
@@ -101,6 +99,8 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     for note in motion.notes:
         say(f"note: {note}")
     shape = body.neutral().shape.clone()
+    if len(config.shape) > body.n_shape:
+        raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
     shape[0, : len(config.shape)] = torch.tensor(config.shape)
     pose = led_in(motion.body(shape))
     with torch.no_grad():
@@ -116,7 +116,7 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     figures: dict = {"garments": {}, "notes": list(motion.notes), "frames": len(motion.pose), "fps": config.fps}
     if config.untangle:
         at = time.perf_counter()
-        worn, figures["untangle"] = untangled(worn, posed, body)
+        worn, figures["untangle"] = untangled(worn, posed, body, say)
         say(f"{'untangle':<16} {time.perf_counter() - at:6.1f} s")
     names = [_file_name(name) for name in config.garments]
     for name, part in zip(names, worn, strict=True):
@@ -141,8 +141,18 @@ def _check(config: Animate) -> None:
         raise UserError(f"garments: found {', '.join(names)}; wanted different names, none of them body")
     if config.fps <= 0:
         raise UserError(f"--fps: found {config.fps}; wanted a positive number")
-    if config.out.exists() and any(config.out.iterdir()) and not (config.out / "result.json").exists():
-        raise UserError(f"{config.out}: holds files that are no animation's; wanted an empty folder (--out)")
+    if config.out.exists() and not _is_ours(config.out):
+        raise UserError(f"{config.out}: holds what is no animation's; wanted an empty folder (--out)")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder is empty or holds an earlier animation, and not a photo's result."""
+    if not folder.is_dir():
+        return False
+    try:
+        return not any(folder.iterdir()) or "frames" in json.loads((folder / "result.json").read_text())
+    except (OSError, ValueError):
+        return False
 
 
 def _file_name(garment: str) -> str:
@@ -202,13 +212,17 @@ def simulate(garment: Garment, body: Body, posed: PosedBody, under: Sequence[Mov
     return torch.as_tensor(np.stack(list(path))).float()
 
 
-def untangled(worn: Sequence[Moving], posed: PosedBody, body: Body) -> tuple[list[Moving], dict]:
-    """The layers drawn apart in every frame, and how that went."""
+def untangled(
+    worn: Sequence[Moving], posed: PosedBody, body: Body, say: Callable[[str], None] | None = None
+) -> tuple[list[Moving], dict]:
+    """The layers drawn apart in every frame, and how that went; ``say`` hears of every tenth."""
     frames: list[list[Tensor]] = [[] for _ in worn]
     clean, crossings, notes = 0, 0, []
     for k in range(len(posed.mesh.vertices)):
         layers = [Mesh(part.frames[k], part.faces) for part in worn]
         done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces), Untangling(rounds=ROUNDS))
+        if say and k % 10 == 9:
+            say(f"untangle: frame {k + 1} of {len(posed.mesh.vertices)}")
         clean += done.clean
         crossings += done.crossings
         notes += [f"frame {k}: {note}" for note in done.notes]

@@ -257,7 +257,7 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         "steps": done.step,
         "minutes": round(done.seconds / 60, 1),
         "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
-        "licence": "CC0-1.0",
+        "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
     }
     if isinstance(thing, Garment):
         names = ("panel_points", "panel_faces", "panel_of_face", "vertex_of_point", "border_labels")

@@ -59,9 +59,9 @@ class Untangled:
     vertices: list[NDArray]
     """(V, 3) of each layer, as they came [m]."""
     crossings: int
-    """Pairs of faces that still pass through each other, before it began."""
+    """Pairs of faces that passed through each other before it began."""
     left: NDArray
-    """(P, 2) pairs of faces that still do, counted through all layers; empty where it worked."""
+    """(P, 2) pairs of faces that still do, faces counted through all layers; empty where it worked."""
     inside: int
     """Vertices and face centres that are still inside the body."""
     rounds: int
@@ -307,7 +307,7 @@ class _Tangle:
             own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             line = np.cross(own, normal)
             line /= np.maximum(np.linalg.norm(line, axis=1, keepdims=True), 1e-15)
-            inward = (corners.mean(1) - at) - ((corners.mean(1) - at) * along).sum(1)[:, None] * along * 1.0
+            inward = (corners.mean(1) - at) - ((corners.mean(1) - at) * along).sum(1)[:, None] * along
             line *= np.where((line * inward).sum(1) < 0, -1.0, 1.0)[:, None]
             step = line - (((along * line).sum(1) * 2.0 / slope)[:, None]) * normal
             total += np.where(there[:, None], step, 0.0)

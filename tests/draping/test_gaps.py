@@ -191,6 +191,7 @@ def test_layers_are_simulated_over_each_other(motions, tmp_path) -> None:
         ({"garments": ("mini", "mini")}, "different names"),
         ({"start": 99.0}, "--start"),
         ({"fps": 0.0}, "--fps"),
+        ({"shape": (0.0,) * 99}, "--shape"),
         ({"motion": Path("nowhere.npz")}, "no such file"),
     ],
 )
@@ -202,6 +203,10 @@ def test_mistakes_are_one_line(change: dict, says: str, trained, motions, tmp_pa
 
 def test_a_folder_of_something_else_is_left_alone(trained, motions, tmp_path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(UserError, match="holds files"):
+    with pytest.raises(UserError, match="no animation"):
         animate(Animate(("mini",), motions / "march.npz", tmp_path, weights=trained[0]), say=lambda line: None)
     assert (tmp_path / "thesis.txt").read_text() == "mine"
+    (tmp_path / "result.json").write_text('{"schema": 1, "garments": {}}')  # a photo's
+    with pytest.raises(UserError, match="no animation"):
+        animate(Animate(("mini",), motions / "march.npz", tmp_path, weights=trained[0]), say=lambda line: None)
+    assert "schema" in (tmp_path / "result.json").read_text()
