@@ -10,33 +10,27 @@ from __future__ import annotations
 
 import json
 import platform
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from pipelines.drape_training import ARMS, HELD_OUT, read_motions
 from pipelines.garment_source import load_garment
 from pipelines.training import Budget, Training
 from recon.bodies import Body, load_body
-from recon.bodies.retarget import mirrored, motion_of
-from recon.bodies.rig import JOINT_NAMES
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, inertia, towards_template
 from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
 from recon.draping.gaps import Bound, GapsNet, GapsShape, motion_features, smooth_basis
-from recon.files.motions import read_clip
 from recon.files.weights import write_weights
 from recon.garments import WAISTED
 from recon.garments.panels import border_loops, waistband
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
 
-ARMS = torch.tensor(
-    [any(part in name for part in ("collar", "shoulder", "elbow", "wrist", "hand")) for name in JOINT_NAMES]
-)
-"""(24,) which joints are the arms'."""
 FAR = 0.1
 """Distance from the body at which an edge keeps the template's fold entirely (alpha of Eq. 12) [m]."""
 
@@ -51,7 +45,7 @@ class TrainGaps:
     """Folder of motion clips (npz or bvh)."""
     name: str = "tshirt"
     """The weights will be called gaps-NAME."""
-    holdout: tuple[str, ...] = ("jump_turn",)
+    holdout: tuple[str, ...] = HELD_OUT
     """Clips not learned from, by their files' stems."""
     out: Path = Path("out/weights")
     """Folder for the weights, their manifest, the log and the checkpoints."""
@@ -133,28 +127,13 @@ def train_gaps(config: TrainGaps) -> Path:
     if config.skinning not in METHODS:
         raise UserError(f"--skinning: found {config.skinning!r}; wanted one of {', '.join(METHODS)}")
     body = load_body()
-    motions = read_motions(config, body)
+    motions = read_motions(config.motions, config.holdout, body, config.fps)
     template = Template.of(load_garment(config.garment), body)
     if not border_loops(template.mesh.faces.numpy()):
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")
     training = learn(template, motions, body, config)
     assert isinstance(training.module, GapsNet)
     return store(training.module.folded(), template, body, config, training)
-
-
-def read_motions(config: TrainGaps, body: Body) -> list[Motion]:
-    """The clips to learn from and their mirror images, at ``fps``."""
-    files = sorted(p for p in config.motions.glob("*") if p.suffix.lower() in (".npz", ".bvh"))
-    files = [p for p in files if p.stem not in config.holdout]
-    if not files:
-        raise UserError(f"{config.motions}: found no motion clips (npz or bvh) to learn from")
-    motions = [motion_of(read_clip(p), body, config.fps) for p in files]
-    return motions + [_mirror(m) for m in motions]
-
-
-def _mirror(motion: Motion) -> Motion:
-    pose = torch.as_tensor(mirrored(motion.pose.numpy())).float()
-    return replace(motion, pose=pose, translation=motion.translation * torch.tensor([-1.0, 1.0, 1.0]))
 
 
 def learn(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:

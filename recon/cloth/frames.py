@@ -7,6 +7,7 @@ the slow twins that tests compare with.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -197,14 +198,8 @@ class FramePhysics:
             frames: B, the same in every call.
         """
         self.device = str(cloth.masses.device)
-        self.elastic = elastic(cloth, self.device)
-        self.weights, self.frames, self.vertices = weights, frames, len(cloth.masses)
-        self.rings = _Rings()
-        self.rings.neighbours = wp.array(ints(rings.neighbours), dtype=int, device=self.device)
-        self.rings.count = wp.array(ints(rings.count), dtype=int, device=self.device)
-        self.rings.singular = wp.array(doubles(rings.singular), dtype=wp.vec3d, device=self.device)
-        self.rings.size = wp.array(doubles(rings.size), dtype=wp.float64, device=self.device)
-        self.rings.strength = weights.inextensibility
+        self.weights, self.frames = weights, frames
+        self._wear(cloth, rings)
         indices = wp.array(ints(body.faces).ravel(), dtype=int, device=self.device)
         rest = wp.from_torch(body.vertices.detach().float().contiguous(), dtype=wp.vec3)
         # Built on the body at rest and refitted: built on a pose, a hand at the hip would share its box for good.
@@ -215,23 +210,43 @@ class FramePhysics:
         self.touch.stiffness, self.touch.margin, self.touch.reach = weights.collision, weights.margin, weights.reach
         self.touch.steep, self.touch.turns = weights.steep, weights.deep_share
 
-    def __call__(self, x: Tensor, bodies: Tensor, epoch: float = EPOCHS) -> tuple[Tensor, dict[str, Tensor]]:
+    def dressed(self, cloth: Cloth, rings: OneRings) -> FramePhysics:
+        """The same for another garment on the same bodies: posing them for one poses them for both."""
+        other = copy.copy(self)
+        other._wear(cloth, rings)
+        return other
+
+    def _wear(self, cloth: Cloth, rings: OneRings) -> None:
+        self.elastic = elastic(cloth, self.device)
+        self.vertices = len(cloth.masses)
+        self.rings = _Rings()
+        self.rings.neighbours = wp.array(ints(rings.neighbours), dtype=int, device=self.device)
+        self.rings.count = wp.array(ints(rings.count), dtype=int, device=self.device)
+        self.rings.singular = wp.array(doubles(rings.singular), dtype=wp.vec3d, device=self.device)
+        self.rings.size = wp.array(doubles(rings.size), dtype=wp.float64, device=self.device)
+        self.rings.strength = self.weights.inextensibility
+
+    def __call__(
+        self, x: Tensor, bodies: Tensor | None = None, epoch: float = EPOCHS
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """Weighted energies (B,) [J], differentiable in x, and each term (B,) by name.
 
         Args:
             x: (B, V, 3) garment [m].
-            bodies: (B, N, 3) body vertices [m], no gradient.
+            bodies: (B, N, 3) body vertices [m], no gradient; None = where they were last posed.
             epoch: for Eq. 16.
         """
         if len(x) != self.frames or x.shape[1:] != (self.vertices, 3):
             raise ValueError(f"frames: x is {tuple(x.shape)}; wanted ({self.frames}, {self.vertices}, 3)")
-        self._pose(bodies)
+        if bodies is not None:
+            self.pose(bodies)
         self.touch.turn = (self.touch.turn + 1) % self.touch.turns
         self.rings.epoch = float(min(epoch, EPOCHS)) if self.weights.relax else 0.0
         energy, terms = _Energy.apply(x, self)
         return energy, {name: terms[:, k] for k, name in enumerate(TERMS)}
 
-    def _pose(self, bodies: Tensor) -> None:
+    def pose(self, bodies: Tensor) -> None:
+        """Put the bodies (B, N, 3) [m] where they are."""
         for mesh, p in zip(self.meshes, bodies.detach().float().contiguous(), strict=True):
             wp.copy(mesh.points, wp.from_torch(p, dtype=wp.vec3))
             mesh.refit()

@@ -83,6 +83,18 @@ def test_bodies_may_move_between_calls(physics: FramePhysics) -> None:
     torch.testing.assert_close(physics(x, BODIES)[1]["collision"], before)
 
 
+def test_another_garment_shares_the_bodies(physics: FramePhysics) -> None:
+    other = sheet(5, 5, 0.05, 0.05)
+    cloth, rings = Cloth.from_garment(other), OneRings.of(other.mesh.vertices.double(), other.mesh.faces)
+    both, alone = (
+        physics.dressed(cloth, rings),
+        FramePhysics(cloth, rings, Mesh(floor(0.0), FLOOR_FACES), WEIGHTS, FRAMES),
+    )
+    x = other.mesh.vertices.double().expand(FRAMES, -1, -1)
+    physics(crumpled(2), BODIES)  # poses the bodies for both
+    torch.testing.assert_close(both(x)[0], alone(x, BODIES)[0])
+
+
 def test_wrong_sizes_are_refused(physics: FramePhysics) -> None:
     with pytest.raises(ValueError, match="wanted"):
         physics(crumpled()[:2], BODIES[:2])

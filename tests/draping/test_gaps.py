@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipelines.drape_training import read_motions
 from pipelines.sequence import Animate, animate
-from pipelines.train_gaps import Template, TrainGaps, read_motions, train_gaps
+from pipelines.train_gaps import Template, TrainGaps, train_gaps
 from recon.bodies import load_body
 from recon.bodies.rig import axis_angles, rotation_matrices
 from recon.draping.gaps import FEATURES, Bound, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
@@ -137,9 +138,9 @@ def test_the_same_seed_learns_the_same(trained, tmp_path) -> None:
 
 def test_held_out_clips_are_not_learned_from(motions, body) -> None:
     config = TrainGaps("skirt:test:1", motions, holdout=("march",))
-    assert len(read_motions(config, body)) == 2  # one clip and its mirror image
+    assert len(read_motions(config.motions, config.holdout, body, config.fps)) == 2  # one clip and its mirror image
     with pytest.raises(UserError, match="no motion clips"):
-        read_motions(replace(config, holdout=("march", "stroll")), body)
+        read_motions(config.motions, ("march", "stroll"), body, config.fps)
 
 
 def test_any_mesh_can_be_a_template(garment, body) -> None:

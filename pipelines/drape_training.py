@@ -1,0 +1,91 @@
+"""What every training of a draping network needs: motion clips, and bodies in random poses and of random shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from recon.bodies import Body
+from recon.bodies.pose_prior import sample_poses
+from recon.bodies.retarget import mirrored, motion_of
+from recon.bodies.rig import JOINT_NAMES
+from recon.files.motions import read_clip
+from recon.types import BodyPose, Motion, UserError
+
+ARMS = torch.tensor(
+    [any(part in name for part in ("collar", "shoulder", "elbow", "wrist", "hand")) for name in JOINT_NAMES]
+)
+"""(24,) which joints are the arms'."""
+HELD_OUT = ("jump_turn",)
+"""Clips that no training sees, by their files' stems."""
+
+
+def read_motions(folder: Path, holdout: Collection[str], body: Body, fps: float) -> list[Motion]:
+    """The clips of a folder (npz or bvh) at ``fps``, each followed by its mirror image further down the list.
+
+    Raises:
+        UserError: there are none that are not held out, or one can't be read.
+    """
+    files = sorted(p for p in folder.glob("*") if p.suffix.lower() in (".npz", ".bvh"))
+    files = [p for p in files if p.stem not in holdout]
+    if not files:
+        raise UserError(f"{folder}: found no motion clips (npz or bvh) to learn from")
+    motions = [motion_of(read_clip(p), body, fps) for p in files]
+    return motions + [_mirror(m) for m in motions]
+
+
+def _mirror(motion: Motion) -> Motion:
+    pose = torch.as_tensor(mirrored(motion.pose.numpy())).float()
+    return replace(motion, pose=pose, translation=motion.translation * torch.tensor([-1.0, 1.0, 1.0]))
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How bodies for quasi-static draping are drawn."""
+
+    clips: float = 0.5
+    """Share of poses from motion clips; the others are random ones within the joints' limits."""
+    swap: float = 0.5
+    """Share of clip poses whose arms come from another frame: a dozen clips hold few combinations."""
+    spread: float = 1.0
+    """Factor on the deviations of the random poses' Gaussian."""
+    calm: float = 0.2
+    """Share of all poses that are led back towards the T pose by a random factor."""
+    shape_spread: float = 1.0
+    """Standard deviation of the shape coefficients, cut at two: one is the population's."""
+
+
+class BodySampler:
+    """Random bodies to drape on, repeatable from a generator."""
+
+    def __init__(self, motions: Sequence[Motion], n_shape: int, settings: Sampling | None = None):
+        """
+        Args:
+            motions: where clip poses come from; none: all poses are random.
+            n_shape: number of shape coefficients.
+            settings: see :class:`Sampling`.
+        """
+        self.settings = settings or Sampling()
+        self.n_shape = n_shape
+        self.frames = torch.cat([m.pose for m in motions]) if motions else torch.zeros(0, 24, 3)
+
+    def __call__(self, count: int, generator: torch.Generator) -> BodyPose:
+        """``count`` bodies; pelvis turned as in the clips, standing at the origin."""
+        s = self.settings
+
+        def chosen(share: float) -> Tensor:
+            return torch.rand(count, 1, 1, generator=generator) < share
+
+        pose = sample_poses(count, generator, s.spread)
+        if len(self.frames):
+            legs, arms = self.frames[torch.randint(len(self.frames), (2, count), generator=generator)]
+            clip = torch.where(chosen(s.swap) & ARMS[:, None], arms, legs)
+            pose = torch.where(chosen(s.clips), clip, pose)
+        factor = torch.where(chosen(s.calm), torch.rand(count, 1, 1, generator=generator), torch.ones(count, 1, 1))
+        pose = torch.cat([pose[:, :1], pose[:, 1:] * factor], 1)
+        shape = torch.randn(count, self.n_shape, generator=generator).clamp(-2, 2) * s.shape_spread
+        return BodyPose(shape, pose, torch.zeros(count, 3))

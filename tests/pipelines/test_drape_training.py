@@ -1,0 +1,48 @@
+"""Bodies to learn draping on: repeatable, within limits, of all sources."""
+
+from __future__ import annotations
+
+import torch
+
+from pipelines.drape_training import BodySampler, Sampling
+from recon.bodies.pose_prior import joint_limits
+from recon.bodies.poses import stroll
+
+
+def draw(settings: Sampling, motions=(), count: int = 40):
+    return BodySampler(motions, 7, settings)(count, torch.Generator().manual_seed(3))
+
+
+def farthest(poses: torch.Tensor, among: torch.Tensor) -> torch.Tensor:
+    apart = torch.cdist(poses.flatten(1), among.flatten(1), compute_mode="donot_use_mm_for_euclid_dist")
+    return apart.min(1).values.max()
+
+
+def test_repeatable_shapes_and_limits() -> None:
+    settings = Sampling(clips=0.0)
+    first, second = draw(settings), draw(settings)
+    assert first.shape.shape == (40, 7) and first.pose.shape == (40, 24, 3) and first.translation.shape == (40, 3)
+    assert torch.equal(first.pose, second.pose) and torch.equal(first.shape, second.shape)
+    assert first.shape.abs().max() <= 2
+    limits = joint_limits()
+    assert (first.pose >= limits[..., 0] - 1e-6).all() and (first.pose <= limits[..., 1] + 1e-6).all()
+
+
+def test_clip_poses_are_the_clips() -> None:
+    motion = stroll(1.0)
+    poses = draw(Sampling(clips=1.0, swap=0.0, calm=0.0), [motion]).pose
+    assert farthest(poses, motion.pose) < 1e-5
+
+
+def test_swapped_arms_come_from_another_frame() -> None:
+    motion = stroll(2.0)
+    poses = draw(Sampling(clips=1.0, swap=1.0, calm=0.0), [motion]).pose
+    assert farthest(poses, motion.pose) > 1e-3
+
+
+def test_calm_poses_lie_on_the_way_to_t() -> None:
+    motion = stroll(1.0)
+    calm = draw(Sampling(clips=1.0, swap=0.0, calm=1.0), [motion]).pose[:, 1:].flatten(1)
+    clip = motion.pose[:, 1:].flatten(1)
+    cosine = torch.nn.functional.normalize(calm, dim=1) @ torch.nn.functional.normalize(clip, dim=1).T
+    assert (cosine.max(1).values > 0.999).all()
