@@ -67,6 +67,7 @@ COMMANDS = {
     "animate": Command(
         "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
     ),
+    "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", words="what"),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),

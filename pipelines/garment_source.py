@@ -1,15 +1,17 @@
 """Garments as commands name them: ``KIND:CODE`` of a decoder, ``KIND:train:N`` or ``KIND:test:N`` of the data set, or a
-mesh file."""
+mesh file. A CODE is a learned code's number, ``mean``, ``random:SEED`` or a code file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
+from recon.garments import GarmentDecoder
 from recon.types import Garment, Mesh, UserError
 
-FORMS = "KIND:NUMBER, KIND:mean, KIND:random:SEED, KIND:train:N, KIND:test:N or a mesh file"
+FORMS = "KIND:NUMBER, KIND:mean, KIND:random:SEED, KIND:FILE.json, KIND:train:N, KIND:test:N or a mesh file"
 
 
 def load_garment(name: str, resolution: int = 96) -> Garment | Mesh:
@@ -36,7 +38,7 @@ def load_garment(name: str, resolution: int = 96) -> Garment | Mesh:
         from recon.garments.dataset import load_garments
 
         return _pick(name, list(load_garments(kind, split)), number)
-    return _decoded(name, kind, code, resolution)
+    return _decoded(kind, code, resolution)
 
 
 def _pick(name: str, items: list, number: str):
@@ -45,17 +47,33 @@ def _pick(name: str, items: list, number: str):
     return items[int(number)]
 
 
-def _decoded(name: str, kind: str, code: str, resolution: int) -> Garment:
-    from recon.garments import load_decoder
+def latent_of(decoder: GarmentDecoder, code: str) -> Tensor:
+    """The code (z,) that ``code`` names: a learned code's number, ``mean``, ``random:SEED`` or a code file.
+
+    Raises:
+        UserError: no such code, or a file of another kind or size.
+    """
     from recon.garments.latents import LatentPrior
 
-    decoder = load_decoder(kind)
     word, _, seed = code.partition(":")
     if code == "mean":
-        latent = decoder.codes.mean(0)
-    elif word == "random" and seed.isdigit():
-        latent = LatentPrior.of(decoder.codes).sample(1, torch.Generator().manual_seed(int(seed)))[0]
-    else:
-        latent = _pick(name, list(decoder.codes), code)
+        return decoder.codes.mean(0)
+    if word == "random" and seed.isdigit():
+        return LatentPrior.of(decoder.codes).sample(1, torch.Generator().manual_seed(int(seed)))[0]
+    if code.isdigit() and int(code) < len(decoder.codes):
+        return decoder.codes[int(code)]
+    if Path(code).suffix:
+        from recon.files.codes import read_code
+
+        return read_code(code, decoder.kind, decoder.codes.shape[1]).to(decoder.codes)
+    last = len(decoder.codes) - 1
+    raise UserError(f"code: found {code!r}; wanted a number from 0 to {last}, mean, random:SEED or a .json file")
+
+
+def _decoded(kind: str, code: str, resolution: int) -> Garment:
+    from recon.garments import load_decoder
+
+    decoder = load_decoder(kind)
+    latent = latent_of(decoder, code)
     with torch.no_grad():
         return decoder.decode(latent, resolution)

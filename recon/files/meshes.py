@@ -61,6 +61,29 @@ def write_obj(thing: Mesh | Garment, path: str | Path, name: str = "") -> None:
     write_whole(path, "\n".join(lines) + "\n")
 
 
+def write_ply(mesh: Mesh, path: str | Path, name: str = "") -> None:
+    """Write a binary PLY in metres, y up; vertices stay welded. Errors as in ``write_obj``."""
+    import trimesh
+
+    vertices = finite_vertices(mesh, name or Path(path).stem)
+    shape = trimesh.Trimesh(vertices, mesh.faces.cpu().numpy(), process=False)
+    write_whole(path, trimesh.exchange.ply.export_ply(shape, vertex_normal=False))
+
+
+def write_mesh(thing: Mesh | Garment, path: str | Path, colour: Colour = (0.75, 0.75, 0.78)) -> None:
+    """Write OBJ, PLY or GLB, as the path's ending says; OBJ keeps a garment's panels. UserError: another ending."""
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    if kind == "obj":
+        write_obj(thing, path)
+    elif kind == "ply":
+        write_ply(thing.mesh if isinstance(thing, Garment) else thing, path)
+    elif kind == "glb":
+        write_glb({path.stem: (thing, colour)}, path)
+    else:
+        raise UserError(f"{path}: ends in {path.suffix!r}; wanted .obj, .ply or .glb")
+
+
 def write_glb(parts: Mapping[str, tuple[Mesh | Garment, Colour]], path: str | Path) -> None:
     """Write a binary glTF scene: one named node per part, in its sRGB colour (each channel in [0, 1]).
 
