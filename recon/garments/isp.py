@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.isp_net import IspNets, IspShape, Layer
+from recon.garments.isp_lattice import Stencils, lattice_stencils
+from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
-from recon.garments.sewing import sew
+from recon.garments.sewing import Sewn, sew
 from recon.types import Garment, Mesh, UserError
 
 COARSE = (32, 128)
@@ -77,7 +78,7 @@ class IspDecoder:
         with torch.no_grad():
             field = self.nets.pattern.fold(code)
             sewn = self._cut_and_sew(field, resolution)
-        plan = _Plan.make(sewn.points, sewn.faces, sewn.panel_of_face, sewn.vertex_of_point, sewn.labels, latent)
+        plan = _Plan.make(sewn, latent, resolution)
         steps = 2.0 / resolution * MAX_STEP
         points = self._on_border(field, plan, plan.points, steps, 1)
         return self._remember(self._garment(latent, replace(plan, points=points), None), plan)
@@ -92,14 +93,8 @@ class IspDecoder:
             plan = replace(self._plan[1], points=self.nets.to_domain(garment.panel_points))
         else:
             points = self.nets.to_domain(garment.panel_points.detach())
-            plan = _Plan.make(
-                points.cpu().numpy(),
-                garment.panel_faces.cpu().numpy(),
-                garment.panel_of_face.cpu().numpy(),
-                garment.vertex_of_point.cpu().numpy(),
-                garment.border_labels.cpu().numpy(),
-                latent,
-            )
+            topology = (garment.panel_faces, garment.panel_of_face, garment.vertex_of_point, garment.border_labels)
+            plan = _Plan.make(Sewn(points.cpu().double().numpy(), *(t.cpu().numpy() for t in topology)), latent)
         with torch.no_grad():
             field = self.nets.pattern.fold(latent.detach())
         points = self._on_border(field, plan, plan.points, 0.05, 2)
@@ -148,12 +143,17 @@ class IspDecoder:
         """Signed distances (n, n, 2) at all pairs of ``axis``, evaluated in ``needed`` coarse cells only."""
         if known is None or needed is None:
             grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
-            return self.nets.pattern.run_folded(field, grid.view(-1, 2))[:, :2].view(*grid.shape)
+            return self._distance(field, grid.view(-1, 2)).view(*grid.shape)
         cell = ((axis + 1) * (len(known) / 2)).long().clamp(0, len(known) - 1)
         distance = torch.where(known > 0, FAR, -FAR).to(axis.dtype)[cell[:, None], cell[None]]
         i, j = needed[cell[:, None], cell[None]].nonzero(as_tuple=True)
-        distance[i, j] = self.nets.pattern.run_folded(field, torch.stack([axis[i], axis[j]], 1))[:, :2]
+        distance[i, j] = self._distance(field, torch.stack([axis[i], axis[j]], 1))
         return distance
+
+    def _distance(self, field: list[Layer], x: Tensor) -> Tensor:
+        """(N, 2) signed distances, good to a tenth of a fine grid's cell: what they cut is projected afterwards."""
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=halves_are_fast(x.device)):
+            return self.nets.pattern.run_folded(field, x)[:, :2].to(x.dtype)
 
     def _slope(self, field: list[Layer], x: Tensor, panel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Signed distance (N,), its gradient (N, 2) in x, and label logits (N, L) of each point's own panel."""
@@ -191,8 +191,10 @@ class IspDecoder:
             step = slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
             border = border - step * (own - own.detach())[:, None]
         x = torch.cat([points[plan.inner], border])
-        lifted = nets.lift(nets.surface.run_folded(nets.surface.fold(latent), x), x)
-        own = lifted.flatten(0, 1)[plan.lifted_row]
+        raw = nets.surface.run_folded(nets.surface.fold(latent), x)
+        between = plan.lattice.interpolate(raw)
+        x = torch.cat([x, points[plan.between]])
+        own = nets.lift(torch.cat([raw, between]), x).flatten(0, 1)[plan.lifted_row]
         vertices = torch.zeros(plan.n_vertices, 3, dtype=own.dtype, device=own.device)
         vertices = nets.to_world(vertices.index_add(0, plan.vertex_of_point, own) / plan.points_per_vertex[:, None])
         panel_points = nets.to_panel(points)
@@ -239,25 +241,34 @@ class _Plan:
     border_panel: Tensor
     """(B,) 0 front, 1 back."""
     inner: Tensor
-    """(I,) one representative per distinct inner point."""
+    """(I,) one representative per distinct inner point that the network is asked about."""
+    between: Tensor
+    """(J,) one representative per distinct inner point that is interpolated."""
+    lattice: Stencils
+    """Where those J come from, among the I + B."""
     lifted_row: Tensor
-    """(P,) row of each point among 2 (I + B) lifted positions, front and back of a point beside each other."""
+    """(P,) row of each point among 2 (I + B + J) lifted positions, front and back of a point beside each other."""
     points_per_vertex: Tensor
     n_vertices: int
 
     @staticmethod
-    def make(points, faces, panel_of_face, vertex_of_point, labels, like: Tensor) -> _Plan:
-        """From numpy arrays; tensors take the device and dtype of ``like``."""
+    def make(sewn: Sewn, like: Tensor, resolution: int = 0) -> _Plan:
+        """Tensors take the device and dtype of ``like``; ``resolution`` of the grid: fine ones are interpolated."""
+        points, faces, labels = sewn.points, sewn.faces, sewn.labels
         panel = np.zeros(len(points), np.int64)
-        panel[faces[panel_of_face == 1]] = 1
-        on_border = labels >= 0
-        border, inside = np.nonzero(on_border)[0], np.nonzero(~on_border)[0]
+        panel[faces[sewn.panel_of_face == 1]] = 1
+        border, inside = np.nonzero(labels >= 0)[0], np.nonzero(labels < 0)[0]
         keys = np.round((points[inside] + 2) * 2**22).astype(np.int64)
         _, first, which = np.unique(keys[:, 0] * 2**30 + keys[:, 1], return_index=True, return_inverse=True)
+        used = np.bincount(which, 1 << panel[inside], len(first)).astype(np.uint8)
+        asked, stencils = lattice_stencils(points[inside[first]], used, resolution)
+        place = np.empty(len(first), np.int64)
+        place[asked] = np.arange(asked.sum())
+        place[~asked] = asked.sum() + len(border) + np.arange((~asked).sum())
         row = np.empty(len(points), np.int64)
-        row[inside] = 2 * which + panel[inside]
-        row[border] = 2 * (len(first) + np.arange(len(border))) + panel[border]
-        counts = np.bincount(vertex_of_point)
+        row[inside] = 2 * place[which] + panel[inside]
+        row[border] = 2 * (asked.sum() + np.arange(len(border))) + panel[border]
+        counts = np.bincount(sewn.vertex_of_point)
 
         def index(a: np.ndarray) -> Tensor:
             return torch.as_tensor(a, dtype=torch.long, device=like.device)
@@ -265,12 +276,14 @@ class _Plan:
         return _Plan(
             points=torch.as_tensor(points, dtype=like.dtype, device=like.device),
             faces=index(faces),
-            panel_of_face=index(panel_of_face),
-            vertex_of_point=index(vertex_of_point),
+            panel_of_face=index(sewn.panel_of_face),
+            vertex_of_point=index(sewn.vertex_of_point),
             labels=index(labels),
             border=index(border),
             border_panel=index(panel[border]),
-            inner=index(inside[first]),
+            inner=index(inside[first[asked]]),
+            between=index(inside[first[~asked]]),
+            lattice=Stencils(index(place[stencils.nodes]), stencils.weights.to(like)),
             lifted_row=index(row),
             points_per_vertex=torch.as_tensor(counts, dtype=like.dtype, device=like.device),
             n_vertices=len(counts),

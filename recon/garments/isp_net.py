@@ -18,6 +18,11 @@ CHUNK = 4096
 """Points per pass: the activations of one layer stay in a core's cache."""
 
 
+def halves_are_fast(device: torch.device) -> bool:
+    """Whether products of bfloat16 matrices cost far less than those of floats: on CPUs with tiles for them (AMX)."""
+    return device.type == "cpu" and bool(getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16"))
+
+
 @dataclass(frozen=True)
 class Layer:
     """One linear layer with the code folded in, for B garments (or without the batch axis for one)."""

@@ -39,6 +39,12 @@ class Panel:
         return np.concatenate(self.loops) if self.loops else np.zeros(0, np.int64)
 
 
+def corners(mask: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """(F, 3) -> (F,) how many of each face's corners hold; several times as fast as a sum along so short an axis."""
+    count = mask.view(np.int8)
+    return count[:, 0] + count[:, 1] + count[:, 2]
+
+
 def grid_axis(resolution: int) -> NDArray[np.float64]:
     """The grid's coordinates along one axis of the domain: ``resolution`` cells."""
     return np.linspace(-1.0, 1.0, resolution + 1)
@@ -76,15 +82,19 @@ def cut_panel(distance: NDArray) -> Panel:
     axis = grid_axis(n - 1)
     cell = axis[1] - axis[0]
     sign = clean_signs(distance, cell)
-    inside = sign < 0
-    touched = inside[:-1, :-1] | inside[1:, :-1] | inside[1:, 1:] | inside[:-1, 1:]
-    i, j = np.nonzero(touched)
+    inside = (sign < 0).view(np.int8)
+    count = inside[:-1, :-1] + inside[1:, :-1] + inside[1:, 1:] + inside[:-1, 1:]
+    faces, cuts = _cut_triangles(_halves(*np.nonzero((count > 0) & (count < 4)), n), sign.ravel(), n * n)
+    faces = np.concatenate([_halves(*np.nonzero(count == 4), n), faces])
+    points, faces, rim = _place(faces, cuts, distance.ravel(), sign.ravel())
+    faces, points = split_pinches(faces, points, rim)
+    return Panel(points, faces, border_loops(faces, np.append(rim, np.ones(len(points) - len(rim), bool))))
+
+
+def _halves(i: NDArray, j: NDArray, n: int) -> NDArray:
+    """The two triangles of each grid cell (i, j)."""
     a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
-    triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    faces, cuts = _cut_triangles(triangles, sign.ravel(), n * n)
-    points, faces = _place(faces, cuts, distance.ravel(), axis)
-    faces, points = split_pinches(faces, points)
-    return Panel(points, faces, border_loops(faces))
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
 def _rotate(triangles: NDArray, first: NDArray) -> NDArray:
@@ -95,8 +105,9 @@ def _rotate(triangles: NDArray, first: NDArray) -> NDArray:
 def _cut_triangles(triangles: NDArray, sign: NDArray, base: int) -> tuple[NDArray, NDArray]:
     """Faces of the kept parts; indices from ``base`` on point into the returned cut edges (K, 2) of grid vertices."""
     t = sign[triangles]
-    triangles, t = triangles[(t < 0).any(1)], t[(t < 0).any(1)]
-    positive = (t > 0).sum(1)
+    kept = corners(t < 0) > 0
+    triangles, t = triangles[kept], t[kept]
+    positive = corners(t > 0)
     faces = [triangles[positive == 0]]
     edges: list[NDArray] = []
 
@@ -119,9 +130,10 @@ def _cut_triangles(triangles: NDArray, sign: NDArray, base: int) -> tuple[NDArra
     return np.concatenate(faces), np.concatenate(edges)
 
 
-def _place(faces: NDArray, cuts: NDArray, distance: NDArray, axis: NDArray) -> tuple[NDArray, NDArray]:
-    """Merge equal cut vertices, drop unused ones, and give every vertex its place."""
-    n = len(axis)
+def _place(faces: NDArray, cuts: NDArray, distance: NDArray, sign: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Merge equal cut vertices, drop unused ones, give every vertex its place; last, who may lie on the border."""
+    n = int(len(distance) ** 0.5)
+    axis = grid_axis(n - 1)
     keys, which = np.unique(cuts[:, 0] * (n * n) + cuts[:, 1], return_inverse=True)
     inner, outer = keys // (n * n), keys % (n * n)
     old = faces.ravel()
@@ -137,13 +149,18 @@ def _place(faces: NDArray, cuts: NDArray, distance: NDArray, axis: NDArray) -> t
     end = np.stack([axis[outer // n], axis[outer % n]], 1)
     crossing = start + np.clip(share, 0.15, 0.85)[:, None] * (end - start)
     points = np.concatenate([np.stack([axis[grid // n], axis[grid % n]], 1), crossing[used[n * n :]]])
-    return points, number[new].reshape(-1, 3)
+    rim = np.append(sign[grid] == 0, np.ones(len(points) - len(grid), bool))
+    return points, number[new].reshape(-1, 3), rim
 
 
-def border_edges(faces: NDArray) -> NDArray:
-    """(E, 2) directed edges that have one face only, the face on their left."""
+def border_edges(faces: NDArray, rim: NDArray | None = None) -> NDArray:
+    """(E, 2) directed edges that have one face only, the face on their left; ``rim`` (V,) says who may lie there."""
     size = int(faces.max()) + 1 if len(faces) else 1
+    if rim is not None:
+        faces = faces[corners(rim[faces]) >= 2]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    if rim is not None:
+        edges = edges[rim[edges[:, 0]] & rim[edges[:, 1]]]
     keys = edges.min(1) * size + edges.max(1)
     order = np.argsort(keys, kind="stable")
     ranked = keys[order]
@@ -153,14 +170,14 @@ def border_edges(faces: NDArray) -> NDArray:
     return edges[order[alone]]
 
 
-def split_pinches(faces: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
+def split_pinches(faces: NDArray, points: NDArray, rim: NDArray | None = None) -> tuple[NDArray, NDArray]:
     """Give every fan of faces around a border vertex its own copy, so that borders are simple loops."""
-    edges = border_edges(faces)
+    edges = border_edges(faces, rim)
     starts, counts = np.unique(edges[:, 0], return_counts=True)
     faces = faces.copy()
     extra: list[NDArray] = []
     for vertex in starts[counts > 1]:
-        around = np.nonzero((faces == vertex).any(1))[0]
+        around = np.nonzero(corners(faces == vertex))[0]
         fans = [{int(f)} for f in around]
         rims = [set(faces[f].tolist()) - {int(vertex)} for f in around]
         k = 0
@@ -179,9 +196,9 @@ def split_pinches(faces: NDArray, points: NDArray) -> tuple[NDArray, NDArray]:
     return faces, np.concatenate([points, np.array(extra)]) if extra else points
 
 
-def border_loops(faces: NDArray) -> list[NDArray]:
-    """Closed border loops of a mesh without pinched vertices, longest first."""
-    edges = border_edges(faces)
+def border_loops(faces: NDArray, rim: NDArray | None = None) -> list[NDArray]:
+    """Closed border loops of a mesh without pinched vertices, longest first; ``rim`` as in ``border_edges``."""
+    edges = border_edges(faces, rim)
     following = dict(zip(edges[:, 0].tolist(), edges[:, 1].tolist(), strict=True))
     loops = []
     while following:
@@ -218,7 +235,8 @@ def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray
     share = np.ones(len(index))
     row = np.full(len(points), -1)
     row[index] = np.arange(len(index))
-    near = faces[(row[faces] >= 0).any(1)]
+    moving = row >= 0
+    near = faces[corners(moving[faces]) > 0]
     floor = 0.02 * np.abs(signed_areas(points, near))
     moved = points.copy()
     for attempt in range(4):

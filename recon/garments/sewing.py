@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from recon.garments.panels import Panel, border_edges, border_loops, cross, move_safely
+from recon.garments.panels import Panel, border_edges, border_loops, corners, cross, move_safely
 
 SHORTEST_RUN = 0.025
 """Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
@@ -219,7 +219,7 @@ class _Growing:
         self.face_at: dict[tuple[int, int], int] = {}
         on_border = np.zeros(len(panel.points), bool)
         on_border[panel.border] = True
-        rim = np.nonzero(on_border[panel.faces].sum(1) >= 2)[0]
+        rim = np.nonzero(corners(on_border[panel.faces]) >= 2)[0]
         owner: dict[tuple[int, int], int] = {}
         for f, (a, b, c) in zip(rim.tolist(), panel.faces[rim].tolist(), strict=True):
             owner[(a, b)] = owner[(b, c)] = owner[(c, a)] = f
@@ -269,7 +269,8 @@ class _Growing:
         """Points, faces and labels; points moved along the border no further than no triangle flips."""
         points = np.concatenate([self.panel.points, np.array(self.new_points).reshape(-1, 2)])
         faces = np.concatenate([self.faces, np.array(self.new_faces, np.int64).reshape(-1, 3)])
-        moved = np.nonzero((self.moved != self.panel.points).any(1))[0]
+        away = self.moved != self.panel.points
+        moved = np.nonzero(away[:, 0] | away[:, 1])[0]
         points = move_safely(points, faces, moved, self.moved[moved])
         return points, faces, np.concatenate([self.labels, np.array(self.new_labels, np.int64)])
 
@@ -277,7 +278,7 @@ class _Growing:
 def split_chords(points: NDArray, faces: NDArray, labels: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Split inner edges that join two seam points, so that sewing never makes an edge of four faces."""
     for _ in range(6):
-        close = np.nonzero((labels > 0)[faces].sum(1) >= 2)[0]
+        close = np.nonzero(corners((labels > 0)[faces]) >= 2)[0]
         near = faces[close]
         ends = np.concatenate([near[:, [0, 1]], near[:, [1, 2]], near[:, [2, 0]]])
         owner = np.tile(close, 3)
