@@ -20,7 +20,8 @@ CHUNK = 4096
 
 def halves_are_fast(device: torch.device) -> bool:
     """Whether products of bfloat16 matrices cost far less than those of floats: on CPUs with tiles for them (AMX)."""
-    return device.type == "cpu" and bool(getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16"))
+    known = getattr(torch.cpu, "get_capabilities", None)
+    return device.type == "cpu" and known is not None and bool(known().get("amx_bf16"))
 
 
 @dataclass(frozen=True)

@@ -84,15 +84,17 @@ def cut_panel(distance: NDArray) -> Panel:
     sign = clean_signs(distance, cell)
     inside = (sign < 0).view(np.int8)
     count = inside[:-1, :-1] + inside[1:, :-1] + inside[1:, 1:] + inside[:-1, 1:]
-    faces, cuts = _cut_triangles(_halves(*np.nonzero((count > 0) & (count < 4)), n), sign.ravel(), n * n)
-    faces = np.concatenate([_halves(*np.nonzero(count == 4), n), faces])
+    faces, cuts = _cut_triangles(_halves((count > 0) & (count < 4)), sign.ravel(), n * n)
+    faces = np.concatenate([_halves(count == 4), faces])
     points, faces, rim = _place(faces, cuts, distance.ravel(), sign.ravel())
     faces, points = split_pinches(faces, points, rim)
     return Panel(points, faces, border_loops(faces, np.append(rim, np.ones(len(points) - len(rim), bool))))
 
 
-def _halves(i: NDArray, j: NDArray, n: int) -> NDArray:
-    """The two triangles of each grid cell (i, j)."""
+def _halves(cells: NDArray[np.bool_]) -> NDArray:
+    """The two triangles of each of the cells (n - 1, n - 1)."""
+    n = len(cells) + 1
+    i, j = np.nonzero(cells)
     a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
