@@ -58,23 +58,59 @@ def tangled_share(layers: list[Mesh]) -> float:
     return float(area[np.unique(search.pairs(search(x)))].sum() / area.sum())
 
 
-def random_tangle(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
-    """Layers put over each other without knowing of each other; puffed out until at most ``MOST`` is tangled."""
+def layers_of(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
+    """Two to five layers put over each other without knowing of each other, whatever their sizes."""
     count = int(rng.integers(2, 6))
     names = sorted(rng.choice(ORDER, count, replace=False), key=ORDER.index)
-    worn = [wardrobe.garments[name][rng.integers(len(wardrobe.garments[name]))].mesh for name in names]
+    return [wardrobe.garments[name][rng.integers(len(wardrobe.garments[name]))].mesh for name in names]
+
+
+def unfitting(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
+    """Layers of any sizes, puffed out until at most ``MOST`` is tangled: wide ones may have to go under narrow ones."""
+    worn = layers_of(wardrobe, rng)
     for step in range(12):
-        layers = [puffed(m, 0.0015 * step * (count - 1 - k)) for k, m in enumerate(worn)]
+        layers = [puffed(m, 0.0015 * step * (len(worn) - 1 - k)) for k, m in enumerate(worn)]
         if tangled_share(layers) <= MOST:
             break
     return layers
 
 
-def run_tangles(cases: int, seed: int = 0) -> Iterator[dict]:
-    """Untangle ``cases`` random tangles; one row each."""
+def displaced(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
+    """Layers that fit over each other, each displaced by smooth noise until just under ``MOST`` is tangled."""
+    while True:
+        worn = unfitting(wardrobe, rng)
+        done = untangle(worn, wardrobe.body)
+        if done.clean:
+            break
+    fitting = [m.with_vertices(torch.from_numpy(x).float()) for m, x in zip(worn, done.vertices, strict=True)]
+    fields = [smooth_noise(m.vertices, rng) for m in fitting]
+    layers = fitting
+    for size in np.linspace(0.0, 0.03, 13)[1:]:
+        moved = [m.with_vertices(m.vertices + size * noise) for m, noise in zip(fitting, fields, strict=True)]
+        if tangled_share(moved) > MOST:
+            break
+        layers = moved
+    return layers
+
+
+def smooth_noise(x: torch.Tensor, rng: np.random.Generator, waves: int = 24) -> torch.Tensor:
+    """(V, 3) displacements of unit size with wavelengths from 8 to 40 cm."""
+    direction = rng.normal(size=(waves, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    frequency = 2 * np.pi / rng.uniform(0.08, 0.4, waves)
+    phase = x.double().numpy() @ (direction * frequency[:, None]).T + rng.uniform(0, 2 * np.pi, waves)
+    field = np.sin(phase) @ rng.normal(size=(waves, 3)) / np.sqrt(waves / 2)
+    return torch.from_numpy(field).float()
+
+
+FAMILIES = {"displaced": displaced, "unfitting": unfitting}
+
+
+def run_tangles(cases: int, seed: int = 0, family: str = "displaced") -> Iterator[dict]:
+    """Untangle ``cases`` random tangles of one of ``FAMILIES``; one row each."""
     wardrobe, rng = Wardrobe.load(), np.random.default_rng(seed)
     for number in range(cases):
-        layers = random_tangle(wardrobe, rng)
+        layers = FAMILIES[family](wardrobe, rng)
         share = tangled_share(layers)
         begin = time.perf_counter()
         done = untangle(layers, wardrobe.body)
@@ -84,6 +120,7 @@ def run_tangles(cases: int, seed: int = 0) -> Iterator[dict]:
         ]
         pairs = len(layers) * (len(layers) - 1) / 2
         yield {
+            "family": family,
             "case": number,
             "layers": len(layers),
             "tangled_share": round(share, 4),

@@ -23,11 +23,14 @@ from numpy.typing import NDArray
 
 from recon.cloth.contact import BodyContact
 from recon.cloth.intersections import Crossings
+from recon.cloth.patches import Pockets, laid_across
 from recon.cloth.xpbd import keep_lengths
 from recon.types import Mesh
 
 WORSE = 2.0
 """So many times as many crossings as at best mean that steps are too long."""
+PATIENCE = 10
+"""So many rounds without much progress, then pockets are laid across their curves."""
 CALMEST = 0.1
 """Where steps had to be made shorter than this share, there is no way out."""
 
@@ -105,6 +108,7 @@ class _Tangle:
         self.lengths = np.linalg.norm(self.x[self.edges[:, 0]] - self.x[self.edges[:, 1]], axis=1)
         self.scale = float(self.lengths.mean())
         self.rims = self._rims()
+        self.pockets = Pockets(self.crossings, self.x, self.layer)
         self.body = None
         self.asked: NDArray | None = None
         self.temper = 1.0  # factor on the steps against the curve
@@ -124,13 +128,18 @@ class _Tangle:
         s = self.settings
         found, lack = self.crossings(self.x), self._lack()
         before = len(self.crossings.pairs(found))
-        best, best_x, rounds = (int(lack.sum()), len(found)), self.x.copy(), 0
+        best, best_x, rounds, stuck = (int(lack.sum()), len(found)), self.x.copy(), 0, 0
         while any(best) and rounds < s.rounds and self.temper > CALMEST:
+            if stuck >= PATIENCE:
+                self._lay_pockets(found)
+                found, stuck = self.crossings(self.x), 0
             self._round(found, rounds)
             found, lack = self.crossings(self.x), self._lack()
             rounds += 1
             now = int(lack.sum()), len(found)
+            stuck += 1
             if now < best:
+                stuck = stuck if now[1] > 0.8 * best[1] else 0
                 best, best_x, self.temper = now, self.x.copy(), min(1.0, 1.15 * self.temper)
             elif len(found) > WORSE * best[1] + 50:
                 self.x, self.temper = best_x.copy(), self.temper * 0.7
@@ -154,6 +163,16 @@ class _Tangle:
         moved |= self._leave_body(number)
         self._relax(moved, number)
         self._leave_body(number, 10)
+
+    def _lay_pockets(self, found: NDArray) -> None:
+        """Pockets that poke through other cloth are laid across the curve where they do."""
+        crossing = np.zeros(len(self.edges), bool)
+        crossing[found[:, 0]] = True
+        free = self.pockets.find(crossing)
+        self.x = laid_across(self.x, self.edges, free)
+        mine = free[self.edges].any(1)
+        ends = self.x[self.edges[mine]]
+        self.lengths[mine] = np.minimum(self.lengths[mine], np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
 
     def _notes(self, left: NDArray, inside: int) -> tuple[str, ...]:
         lines = []
