@@ -50,6 +50,24 @@ def _show_photo(fit_photo: Callable[..., Any], config: Any) -> int:
     return OK
 
 
+def _show_scan(fit_scan: Callable[..., Any], config: Any) -> int:
+    """Fit with progress on stderr; the figures and where the results lie on stdout."""
+    from pipelines.progress import Progress
+
+    with Progress() as progress:
+        result = fit_scan(config, say=progress.say, tick=progress.tick)
+    for note in result.figures.get("notes", []):
+        print(f"note: {note}")
+    for name, found in result.figures["garments"].items():
+        print(
+            f"{name}: {found['scan_mm']:.1f} mm from its scan (median; {found['scan_mm_code_only']:.1f} by its code "
+            f"alone), {found['penetrating_vertices']} vertices inside the body, {found['self_intersections']} "
+            f"self-intersections, stretch p95 {found['stretch_p95']:.3f}"
+        )
+    print(f"{Path(result.folder) / 'report.html'}   ({result.figures['seconds']['total']:.0f} s)")
+    return OK
+
+
 def _show_animation(animate: Callable[..., Any], config: Any) -> int:
     """Drape with a line a stage on stderr; the figures and where the results lie on stdout."""
     result = animate(config, say=lambda line: print(line, file=sys.stderr))
@@ -64,6 +82,7 @@ def _show_animation(animate: Callable[..., Any], config: Any) -> int:
 
 COMMANDS = {
     "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo, "photo"),
+    "scan": Command("fit the garments of a labelled scan", "pipelines.scan", "ScanFit", "fit_scan", _show_scan, "scan"),
     "animate": Command(
         "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
     ),

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipelines.codes import Decoding, retrieved
 from pipelines.evidence import level
 from pipelines.fit_body import BodyFit, evidence_loss, to_body, to_camera
 from recon.bodies import Body
@@ -17,7 +18,7 @@ from recon.cloth.contact import BodyContact
 from recon.descend import Descent, descend
 from recon.draping import Draper
 from recon.garments import GarmentDecoder
-from recon.garments.latents import LatentPrior, Neighbourhood, nearest, of_variants, spread
+from recon.garments.latents import LatentPrior, Neighbourhood, of_variants
 from recon.losses import chamfer_pull, depth_penalty, hard_iou, soft_iou_loss
 from recon.types import Camera, Garment, Photo, PosedBody, UserError
 
@@ -107,26 +108,15 @@ def silhouette(pixels: np.ndarray, faces: np.ndarray, size: tuple[int, int]) -> 
 def retrieve(
     name: str, values: dict[str, Tensor], photo: Photo, models: Models, settings: GarmentFit, tick=None
 ) -> Tensor:
-    """Codes by the overlap of their draped silhouettes with the mask, best first.
+    """(n,) codes by the overlap of their draped silhouettes with the mask, best first (see ``codes.retrieved``).
 
-    A first round looks at codes that cover all allowed ones, a second at the neighbours of its best: with few codes
-    that is all of them. Pixels under an outer garment's mask count neither for nor against, like hair and hands.
-
-    Returns:
-        (n,) indices into the decoder's codes, best first.
+    Pixels under an outer garment's mask count neither for nor against, like hair and hands.
     """
     decoder = models.decoders[name]
-    allowed = of_variants(decoder.variants, models.variants[name])
     with torch.no_grad():
         score = _silhouette_score(name, values, photo, models, settings)
-        scores = {int(i): score(int(i)) for i in spread(decoder.codes, settings.retrieval_round, allowed)}
-        best = sorted(scores, key=scores.__getitem__, reverse=True)[:3]
-        for index in best:
-            near = nearest(decoder.codes[allowed], decoder.codes[index], settings.retrieval_round // 3)
-            scores |= {i: score(i) for i in allowed[near].tolist() if i not in scores}
-    if tick:
-        tick(len(scores), 1 - max(scores.values()))
-    return torch.tensor(sorted(scores, key=scores.__getitem__, reverse=True))
+        allowed = of_variants(decoder.variants, models.variants[name])
+        return retrieved(decoder.codes, allowed, score, settings.retrieval_round, tick)
 
 
 def _silhouette_score(
@@ -176,29 +166,17 @@ class GarmentLoss:
         allowed = self.decoder.codes[of_variants(self.decoder.variants, models.variants[name])]
         self.prior, self.known = LatentPrior.of(allowed), Neighbourhood.of(allowed)
         self.at = level(photo, long_side).pick((*[layer.name for layer in outer], name))
-        self._shape: Garment | None = None
-        self._cut_at, self._age = self.decoder.codes[0], 0
-        self._reach = 0.3 * self.decoder.codes.std(0).norm().item()
+        self.decoding = Decoding(self.decoder, settings.resolution, settings.refresh)
         on = torch.nonzero(self.at.targets[-1] > 0.5)
         chosen = torch.linspace(0, max(len(on) - 1, 0), min(len(on), 400)).long()
         self.targets = on[chosen].flip(1).to(torch.float32) + 0.5
-
-    def _decode(self, latent: Tensor) -> Garment:
-        """The code's garment: topology is kept for a few steps, since cutting and sewing cost most of a decode."""
-        moved = bool((latent.detach() - self._cut_at).norm() > self._reach)
-        if self._shape is None or moved or self._age >= self.settings.refresh:
-            self._shape = self.decoder.decode(latent, self.settings.resolution)
-            self._cut_at, self._age = latent.detach(), 0
-            return self._shape
-        self._age += 1
-        return self.decoder.decode_like(latent, self._shape)
 
     def __call__(self, values: dict[str, Tensor]) -> Tensor:
         s, models = self.settings, self.models
         posed = models.body.pose(to_body(values))
         camera = self.at.camera(to_camera(values, photo_size(self.photo)))
         try:
-            garment = self._decode(values["latent"])
+            garment = self.decoding(values["latent"])
         except UserError:  # the code left what garments look like: descend goes back to the best
             return values["latent"].sum() * float("nan")
         mine = models.draper.drape(garment, posed).vertices[0]

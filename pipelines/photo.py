@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -11,14 +10,13 @@ from torch import Tensor
 
 from pipelines.fit_body import BodyFit, fit_body
 from pipelines.fit_garment import GarmentFit, Layer, Models, fit_garment
+from pipelines.models import load_models
 from pipelines.refine import Refinement, refine
 from pipelines.results import FitResult, write_results
-from pipelines.run import Run
+from pipelines.run import Run, Say
 from recon.files.state import file_digest
 from recon.files.weights import read_manifest
 from recon.types import Mesh, Photo, UserError, to_device
-
-Say = Callable[[str, str, float], None]
 
 
 @dataclass(frozen=True)
@@ -53,28 +51,6 @@ class PhotoFit:
     """Settings of each garment's stage."""
     refinement: Refinement = field(default_factory=Refinement)
     """Settings of the refine stage."""
-
-
-def load_models(garments: tuple[str, ...], config: PhotoFit) -> Models:
-    """Body, draper, decoders and renderer for the named garments; UserError for unknown names or missing weights."""
-    from recon.bodies import load_body
-    from recon.draping.skinning import SkinningDraper
-    from recon.garments import NAMES, load_decoder
-    from recon.render.labels import LabelRenderer
-
-    unknown = [name for name in garments if name not in NAMES]
-    if unknown:
-        raise UserError(f"--garments: found {', '.join(unknown)}; wanted some of {', '.join(NAMES)}")
-    body = load_body(config.body, config.body_file, config.device)
-    kinds = {name: NAMES[name][0] for name in garments}
-    decoders = {kind: load_decoder(kind, device=config.device, folder=config.weights) for kind in set(kinds.values())}
-    return Models(
-        body=body,
-        draper=SkinningDraper(body),
-        decoders={name: decoders[kind] for name, kind in kinds.items()},
-        variants={name: tuple(NAMES[name][1]) for name in garments},
-        renderer_of=LabelRenderer,
-    )
 
 
 def fit_photo(config: PhotoFit, say: Say | None = None, tick=None) -> FitResult:

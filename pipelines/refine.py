@@ -96,7 +96,11 @@ def push_out(x: Tensor, faces: Tensor, contact: BodyContact, margin: float, roun
     return x
 
 
-class Evidence:
+Evidence = Callable[[list[NDArray]], tuple[float, NDArray]]
+"""Vertices (V, 3) of each layer -> energy [J] and its gradient [N], stacked."""
+
+
+class Silhouettes:
     """The silhouettes' overlap of stacked layers as an energy: value [J] and gradient [N]."""
 
     def __init__(self, posed: PosedBody, faces: list[Tensor], at: Level, camera: Camera, models: Models, weight: float):
@@ -164,13 +168,40 @@ def refine(
     settings: Refinement,
     tick: Callable[[int, float], None] | None = None,
 ) -> Refined:
-    """Refine all layers together.
+    """Refine all layers together under the photo's silhouettes.
 
     Args:
         values: body and camera of the last garment's stage.
         layers: outermost first, all with names in ``photo.garments``.
         photo: the evidence.
         models: body, draper, renderer.
+        settings: see :class:`Refinement`.
+        tick: hears (step, energy).
+    """
+
+    def silhouettes(posed: PosedBody, faces: list[Tensor]) -> Evidence:
+        at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
+        camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
+        return Silhouettes(posed, faces, at, camera, models, settings.evidence)
+
+    return refine_with(silhouettes, values, layers, models, settings, tick)
+
+
+def refine_with(
+    evidence_of: Callable[[PosedBody, list[Tensor]], Evidence],
+    values: dict[str, Tensor],
+    layers: list[Layer],
+    models: Models,
+    settings: Refinement,
+    tick: Callable[[int, float], None] | None = None,
+) -> Refined:
+    """Refine all layers together under physics and any evidence.
+
+    Args:
+        evidence_of: posed body and faces (F, 3) of each layer -> the evidence as an energy of the layers' vertices.
+        values: the body's parameters (and the camera's).
+        layers: outermost first.
+        models: body and draper.
         settings: see :class:`Refinement`.
         tick: hears (step, energy).
 
@@ -185,9 +216,7 @@ def refine(
     parts = dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick)
     device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
     body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
-    at = level(photo, settings.long_side).pick(tuple(layer.name for layer in layers))
-    camera = at.camera(to_camera({k: v.detach() for k, v in values.items()}, photo_size(photo)))
-    evidence = Evidence(posed, faces, at, camera, models, settings.evidence)
+    evidence = evidence_of(posed, faces)
     parts = match(parts, garments, body, evidence, settings, tick)
     for _ in range(settings.gradings):  # what is strained under the evidence was cut too short or too wide
         garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, parts)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,22 +23,49 @@ from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
 from recon.files.meshes import Colour, write_glb, write_obj
 from recon.files.patterns import write_svg
-from recon.types import Camera, Garment, Mesh, Photo
+from recon.types import BodyPose, Garment, Mesh, Photo
 
 SCHEMA = 1
 
 
-def grounded(body: Mesh, meshes: dict[str, Mesh], camera: Camera) -> tuple[Mesh, dict[str, Mesh], Camera, Tensor]:
-    """Move the world so that the body's lowest point is at y = 0 below x = z = 0; the camera moves with it.
+def header(config) -> dict:
+    """What every ``result.json`` begins with; ``config`` has ``seed`` and ``device``."""
+    return {"schema": SCHEMA, "seed": config.seed, "device": config.device, "versions": versions()}
+
+
+def described(name: str, place: BodyPose) -> dict:
+    """The body model's name and numbers for ``result.json``."""
+    return {
+        "name": name,
+        "shape": place.shape[0].tolist(),
+        "pose": place.pose[0].tolist(),
+        "translation": place.translation[0].tolist(),
+    }
+
+
+def write_meshes(out: Path, body: Mesh, layers: Sequence[Layer], moved: dict[str, Mesh]) -> None:
+    """``body.obj``, each garment as OBJ and its pattern as SVG, and ``scene.glb`` with all of them."""
+    write_obj(body, out / "body.obj", "body")
+    parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, colour_of("body"))}
+    for layer in layers:
+        garment = replace(layer.garment, mesh=moved[layer.name])
+        write_obj(garment, out / f"{layer.name}.obj", layer.name)
+        write_svg(layer.garment, out / "patterns" / f"{layer.name}.svg", layer.name)
+        parts[layer.name] = (garment, colour_of(layer.name))
+    write_glb(parts, out / "scene.glb")
+
+
+def grounded(body: Mesh, meshes: dict[str, Mesh]) -> tuple[Mesh, dict[str, Mesh], Tensor]:
+    """Move the world so that the body's lowest point is at y = 0 below x = z = 0.
 
     Returns:
-        Body, garments, camera, and the (3,) shift that was added to every vertex [m].
+        Body, garments, and the (3,) shift that was added to every vertex [m].
     """
     v = body.vertices
     middle = (v.min(0).values + v.max(0).values) / 2
     shift = -torch.stack([middle[0], v[:, 1].min(), middle[2]])
     moved = {k: m.with_vertices(m.vertices + shift) for k, m in meshes.items()}
-    return body.with_vertices(v + shift), moved, replace(camera, t=camera.t - camera.R @ shift), shift
+    return body.with_vertices(v + shift), moved, shift
 
 
 def versions() -> dict[str, str]:
@@ -87,33 +115,19 @@ def write_results(
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
     camera = to_camera(values, photo_size(photo))
-    body, moved, camera, shift = grounded(Mesh(posed.mesh.vertices[0], models.body.faces), meshes, camera)
+    body, moved, shift = grounded(Mesh(posed.mesh.vertices[0], models.body.faces), meshes)
+    camera = replace(camera, t=camera.t - camera.R @ shift)
     place = replace(to_body(values), translation=values["translation"] + shift)
     figures = {
-        "schema": SCHEMA,
-        "seed": config.seed,
-        "device": config.device,
-        "versions": versions(),
+        **header(config),
         **measure_all(values, layers, meshes, photo, models),
         "camera": {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(), "size": list(camera.size)},
-        "body_model": {
-            "name": config.body,
-            "shape": place.shape[0].tolist(),
-            "pose": place.pose[0].tolist(),
-            "translation": place.translation[0].tolist(),
-        },
+        "body_model": described(config.body, place),
         "confidence": photo.confidence,
         "notes": list(photo.notes),
     }
-    write_obj(body, out / "body.obj", "body")
-    parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, colour_of("body"))}
-    for layer in layers:
-        garment = replace(layer.garment, mesh=moved[layer.name])
-        write_obj(garment, out / f"{layer.name}.obj", layer.name)
-        write_svg(layer.garment, out / "patterns" / f"{layer.name}.svg", layer.name)
-        parts[layer.name] = (garment, colour_of(layer.name))
-    write_glb(parts, out / "scene.glb")
-    result = FitResult(out, figures, photo, camera, place, body, tuple(layers), moved)
+    write_meshes(out, body, layers, moved)
+    result = FitResult(out, figures, place, body, tuple(layers), moved, photo=photo, camera=camera)
     pictures = write_pictures(result)
     took = time.perf_counter() - begin
     figures["seconds"] = {**seconds, "export": took, "total": sum(seconds.values()) + took}

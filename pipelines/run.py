@@ -18,6 +18,9 @@ from recon.types import UserError
 
 Value = TypeVar("Value")
 
+Say = Callable[[str, str, float], None]
+"""Hears (stage, event, seconds) of every stage's start and end."""
+
 _SCHEMA = 1
 
 

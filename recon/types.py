@@ -153,6 +153,25 @@ class Photo:
     """What a user should know (several people found, feet cut off ...), one line each."""
 
 
+@dataclass(frozen=True)
+class Scan:
+    """Labelled points of one dressed person's surface, as a scanner sees it: no point is under another garment."""
+
+    points: Tensor
+    """(N, 3) world, y up [m]; which way the person faces is not known."""
+    labels: Tensor
+    """(N,) long, index into ``names``; -1 = unlabelled, counts neither for nor against anything."""
+    names: tuple[str, ...]
+    """"body" (skin, hair, shoes), then the garments, outermost first."""
+    notes: tuple[str, ...] = ()
+    """What a user should know (units guessed, points dropped ...), one line each."""
+
+    def of(self, *names: str) -> Tensor:
+        """(n, 3) the points of the named labels."""
+        wanted = torch.tensor([self.names.index(name) for name in names], device=self.labels.device)
+        return self.points[torch.isin(self.labels, wanted)]
+
+
 class UserError(Exception):
     """A user's mistake: one line that names the file, what was found and what was wanted. The CLI exits with 2."""
 

@@ -12,7 +12,7 @@ import torch
 from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models
-from pipelines.refine import Evidence, Refined, Refinement, push_out, refine
+from pipelines.refine import Refined, Refinement, Silhouettes, push_out, refine
 from recon.bodies import load_body
 from recon.cloth.contact import BodyContact
 from recon.draping.dress import Dressing
@@ -84,7 +84,7 @@ def test_evidence_gradient_is_finite_differences(values, layers, refined: Refine
     camera, place = at.camera(to_camera(values, SIZE)), to_body(values)
     away = BODY.pose(replace(place, translation=place.translation + torch.tensor([0.0, 0.0, -200.0])))
     part = refined.meshes["top"].vertices.double().numpy()
-    evidence = Evidence(away, [refined.meshes["top"].faces], at.pick(("top",)), camera, MODELS, 60.0)
+    evidence = Silhouettes(away, [refined.meshes["top"].faces], at.pick(("top",)), camera, MODELS, 60.0)
     value, gradient = evidence([part])
     assert 0 < value < 60 and gradient.shape == part.shape
     for step in ((part - part.mean(0)) * [1, 0, 0] / 0.3, np.zeros_like(part) + [0, 1, 0]):
@@ -97,10 +97,10 @@ def test_evidence_pulls_cloth_back_over_its_mask(values, layers, refined: Refine
     at = level(PHOTO, 64).pick(("trousers",))
     mesh = refined.meshes["trousers"]
     posed, camera = BODY.pose(to_body(values)), at.camera(to_camera(values, SIZE))
-    evidence = Evidence(posed, [mesh.faces], at, camera, MODELS, 60.0)
+    evidence = Silhouettes(posed, [mesh.faces], at, camera, MODELS, 60.0)
     aside = mesh.vertices.double().numpy() + [0.05, 0.0, 0.0]
     assert evidence([aside])[1][:, 0].sum() > 1.0
-    double = Evidence(posed, [mesh.faces], at, camera, MODELS, 120.0)
+    double = Silhouettes(posed, [mesh.faces], at, camera, MODELS, 120.0)
     assert double([aside])[0] == pytest.approx(2 * evidence([aside])[0], rel=1e-5)
 
 

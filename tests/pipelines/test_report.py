@@ -80,7 +80,8 @@ def result(tmp_path, flat_shirt):
     photo = Photo(rgb, mask.float(), {"top": mask}, ~mask, torch.zeros(33, 3), torch.zeros(33, 3))
     pose = BodyPose(torch.zeros(1, 2), torch.zeros(1, 24, 3), torch.zeros(1, 3))
     garments = {"top": shirt.mesh}
-    return FitResult(tmp_path, FIGURES, photo, camera, pose, inner, (Layer("top", shirt),), garments)
+    layers = (Layer("top", shirt),)
+    return FitResult(tmp_path, FIGURES, pose, inner, layers, garments, photo=photo, camera=camera)
 
 
 def test_one_file_that_loads_nothing(result):
