@@ -80,6 +80,21 @@ def _show_animation(animate: Callable[..., Any], config: Any) -> int:
     return OK
 
 
+def _show_drape(drape: Callable[..., Any], config: Any) -> int:
+    """Drape with a line a stage on stderr; the figures and where the results lie on stdout."""
+    result = drape(config, say=lambda line: print(line, file=sys.stderr))
+    for note in result.figures.get("untangle", {}).get("notes", []):
+        print(f"note: {note}")
+    for name, found in result.figures["garments"].items():
+        over = ", ".join(f"{share:.2f} % beneath {inner}" for inner, share in found["beneath_pct"].items())
+        print(
+            f"{name}: by {found['draper']}, {found['inside_body_pct']:.3f} % inside the body, "
+            f"{found['self_intersections']} self-intersections{', ' if over else ''}{over}"
+        )
+    print(f"{result.folder}   ({sum(result.figures['seconds'].values()):.1f} s)")
+    return OK
+
+
 COMMANDS = {
     "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo, "photo"),
     "scan": Command("fit the garments of a labelled scan", "pipelines.scan", "ScanFit", "fit_scan", _show_scan, "scan"),
@@ -87,10 +102,17 @@ COMMANDS = {
         "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
     ),
     "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", words="what"),
+    "drape": Command("dress a body in garments", "pipelines.drape", "Drape", "drape", _show_drape, "garments"),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
     "train gaps": Command("learn to drape a garment in motion", "pipelines.train_gaps", "TrainGaps", "train_gaps"),
+    "train drape-isp": Command(
+        "learn to drape a kind of garment", "pipelines.train_drape_isp", "TrainDrapeIsp", "train_drape_isp"
+    ),
+    "train layers-isp": Command(
+        "learn to layer garments", "pipelines.train_layers_isp", "TrainLayersIsp", "train_layers_isp"
+    ),
     "doctor": Command("say whether everything is in place", "pipelines.doctor", "", "main"),
 }
 

@@ -10,6 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from recon.cloth.contact import BodyContact
+from recon.draping.layering import Beneath
 from recon.types import Garment, Mesh
 
 
@@ -191,3 +193,28 @@ def drape_errors(template: Mesh, x: Tensor, inside: Tensor) -> dict[str, float]:
         errors[name] = 100 * float(((measure(x) - rest).abs() / rest).mean())
     share = 100 * inside.float().mean(1)
     return errors | {"eps_c": float(share.mean()), "eps_c_std": float(share.std(unbiased=False))}
+
+
+def areas_and_middles(mesh: Mesh) -> tuple[Tensor, Tensor, Tensor]:
+    """Of one mesh (V, 3): areas (F,), middles (F, 3) and unit normals (F, 3) of its faces."""
+    a, b, c = mesh.vertices.detach()[mesh.faces].unbind(1)
+    normal = torch.linalg.cross(b - a, c - a)
+    length = normal.norm(dim=1)
+    return length / 2, (a + b + c) / 3, normal / length.clamp_min(1e-12)[:, None]
+
+
+def inside_pct(mesh: Mesh, body: BodyContact) -> float:
+    """Percentage of a garment's area whose faces have their middle inside the body."""
+    area, middle, _ = areas_and_middles(mesh)
+    return 100 * float(area[body.penetrating(middle)].sum() / area.sum().clamp_min(1e-12))
+
+
+def beneath_pct(outer: Mesh, inner: Beneath) -> float:
+    """Percentage of an outer layer's area that lies beneath the layer that it should cover.
+
+    A face counts if its middle is on the inner side of the inner layer's closest point, where that says something: not
+    beside an open border, not further away than ``layering.REACH``, and both facing the same way.
+    """
+    area, middle, normal = areas_and_middles(outer)
+    lack, _ = inner.lack(middle, normal, 0.0)
+    return 100 * float(area[lack > 0].sum() / area.sum().clamp_min(1e-12))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -54,3 +55,8 @@ class SkinningDraper:
         weights, directions = self.bind(rest.vertices, rest.faces)
         shaped = rest.vertices + torch.einsum("nds,bs->bnd", directions, body.shape)
         return skin(shaped, body.transforms, weights)
+
+
+def load_skinning(body, folder: str | Path | None = None) -> SkinningDraper:
+    """The draper without weights; ``folder`` plays no part."""
+    return SkinningDraper(body)

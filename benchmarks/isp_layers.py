@@ -1,0 +1,306 @@
+"""ISP's draping and layering networks on bodies, poses and garments that none of them saw: Tables 5 and 6, and time.
+
+    python benchmarks/isp_layers.py                     # to docs/results/isp-layers.json and isp-layers.md
+    python benchmarks/isp_layers.py --quick             # within a minute; one JSON object last
+
+Half of the bodies stand as in a clip that was held out (where it is at hand), half in random poses within the joints'
+limits; shapes are the population's, cut at two deviations. Garments are new codes between learned ones: trousers (Table
+6) or a skirt (Table 5) and four tops over each other, innermost first.
+
+A percentage is a share of the outer garment's area: the faces whose middle is inside the body (diagonal), or beneath
+the inner layer where that says something (``recon.metrics.beneath_pct``); ``crossing`` is the share of faces that pass
+exactly through a face of the inner layer. Paper, with and without D_m: two layers 0.067 and 0.456, worst pair of five
+2.449 and 28.033.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipelines.drape_garments import between
+from recon.bodies import Body, load_body
+from recon.bodies.pose_prior import sample_poses
+from recon.bodies.retarget import motion_of
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import Cloth, stvk
+from recon.cloth.intersections import Crossings
+from recon.cloth.untangle import untangle
+from recon.draping.isp import IspDraper, load_isp_draper
+from recon.draping.layering import Beneath, Layering, load_layering
+from recon.files.motions import read_clip
+from recon.garments import load_decoder
+from recon.metrics import areas_and_middles, beneath_pct, inside_pct
+from recon.types import BodyPose, Garment, Mesh, PosedBody
+
+ROOT = Path(__file__).resolve().parent.parent
+SHARED = Path(os.environ.get("GARMENT_RECON_SHARED", ROOT.parent / "shared"))
+CLIP = SHARED / "motions" / "jump_turn.npz"
+FIRST = {"skirt": "5", "trousers": "6"}
+"""Kind of the first layer -> the paper's table."""
+TOPS = 4
+UNSEEN = 90_000
+"""Seeds from here on were used by no training."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured."""
+
+    groups: int
+    """Outfits of each first layer, each on bodies of its own."""
+    bodies: int
+    """Bodies of each outfit."""
+    resolution: int
+    """Cells of the grid that garments are cut on."""
+    tangled: int
+    """Cases of each first layer that go through untangling as well."""
+
+
+FULL, QUICK = Size(25, 4, 96, 8), Size(1, 2, 48, 0)
+
+
+def unseen_bodies(count: int, body: Body, seed: int) -> BodyPose:
+    """Bodies of the population, half of them in poses of the held-out clip, where it is at hand."""
+    generator = torch.Generator().manual_seed(UNSEEN + seed)
+    pose = sample_poses(count, generator)
+    if CLIP.is_file():
+        frames = motion_of(read_clip(CLIP), body, 30.0).pose
+        half = count // 2
+        pose[:half] = frames[torch.randint(len(frames), (half,), generator=generator)]
+    shape = torch.randn(count, body.n_shape, generator=generator).clamp(-2, 2)
+    return BodyPose(shape, pose, torch.zeros(count, 3))
+
+
+def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:
+    """Garments of codes between learned ones that no training drew."""
+    decoder = load_decoder(kind)
+    generator = torch.Generator().manual_seed(UNSEEN + seed)
+    with torch.no_grad():
+        return [decoder.decode(between(decoder.codes, generator), resolution) for _ in range(count)]
+
+
+def alone(garments: Sequence[Garment], posed: PosedBody, body: Body, draper: IspDraper) -> list[dict]:
+    """Each garment on each body, by the network and by skinning: penetration [%], strain [J]; one row each."""
+    rows = []
+    for garment in garments:
+        ways = {"network": draper.drape(garment, posed), "skinning": draper.skinning.drape(garment, posed)}
+        cloth = Cloth.from_garment(garment)
+        for k, skin in enumerate(posed.mesh.vertices):
+            contact = BodyContact(skin, body.faces)
+            row: dict = {"kind": garment.kind}
+            for way, mesh in ways.items():
+                x = mesh.vertices[k]
+                row[way] = {"inside_pct": inside_pct(mesh.with_vertices(x), contact), "strain": float(stvk(cloth, x))}
+            rows.append(row)
+    return rows
+
+
+def table(layers: Sequence[Mesh], posed: PosedBody, body: Body) -> np.ndarray:
+    """(2, B, K, K): share beneath [%] and share that crosses exactly [%] of layer j (column) against layer i (row).
+
+    The diagonal is the body's.
+    """
+    count = len(posed.mesh.vertices)
+    out = np.zeros((2, count, len(layers), len(layers)))
+    for b in range(count):
+        contact = BodyContact(posed.mesh.vertices[b], body.faces)
+        here = [m.with_vertices(m.vertices[b]) for m in layers]
+        for i, inner in enumerate(here):
+            out[:, b, i, i] = inside_pct(inner, contact)
+            beneath = Beneath.of(inner.vertices, inner.faces)
+            for j in range(i + 1, len(here)):
+                out[0, b, i, j] = beneath_pct(here[j], beneath)
+                out[1, b, i, j] = crossing_pct(here[j], inner)
+    return out
+
+
+def crossing_pct(outer: Mesh, inner: Mesh) -> float:
+    """Percentage of an outer layer's area in faces that pass through a face of the inner layer, exactly tested."""
+    first = len(outer.vertices)
+    faces = torch.cat([outer.faces, inner.faces + first]).numpy()
+    x = torch.cat([outer.vertices, inner.vertices]).double().numpy()
+    test = Crossings(faces, len(x))
+    pairs = test.pairs(test(x))
+    apart = (pairs < len(outer.faces)).sum(1) == 1  # one face of each layer
+    area = areas_and_middles(outer)[0]
+    hit = torch.zeros(len(area), dtype=torch.bool)
+    hit[torch.as_tensor(pairs[apart].min(1))] = True
+    return 100 * float(area[hit].sum() / area.sum())
+
+
+def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Layering, say) -> tuple[dict, list[dict]]:
+    """One of the two tables, each way, and the rows of the garments alone."""
+    ways: dict[str, list[np.ndarray]] = {"without": [], "forces": [], "with": []}
+    rows, clean = [], []
+    for group in range(size.groups):
+        seed = 100 * group + 7 * list(FIRST).index(kind)
+        garments = unseen_garments(kind, 1, size.resolution, seed) + unseen_garments("top", TOPS, size.resolution, seed)
+        with torch.no_grad():
+            posed = body.pose(unseen_bodies(size.bodies, body, seed))
+            drapes = [draper.drape(g, posed) for g in garments]
+            rows += alone(garments[:2], posed, body, draper)
+            outcomes = {
+                "without": drapes,
+                "forces": Layering(None)(garments, drapes, posed.mesh),
+                "with": layering(garments, drapes, posed.mesh),
+            }
+        for way, layers in outcomes.items():
+            ways[way].append(table(layers, posed, body))
+        if len(clean) < size.tangled:
+            clean.append(drawn_apart(outcomes["with"], posed, body))
+        say(f"{kind}: outfit {group + 1} of {size.groups}")
+    tables = {way: np.concatenate(found, 1) for way, found in ways.items()}
+    figures: dict = {
+        way: {
+            "beneath_pct": found[0].mean(0).round(4).tolist(),
+            "crossing_pct": found[1].mean(0).round(4).tolist(),
+            "two_layers": round(float(found[0, :, 0, 1].mean()), 4),
+            "worst_of_five": round(float(np.triu(found[0].mean(0), 1).max()), 4),
+            "body_worst": round(float(found[0].mean(0).diagonal().max()), 4),
+        }
+        for way, found in tables.items()
+    }
+    figures["cases"] = size.groups * size.bodies
+    if clean:
+        figures["untangled"] = {"cases": len(clean), "clean": sum(c["clean"] for c in clean), "each": clean}
+    return figures, rows
+
+
+def drawn_apart(layers: Sequence[Mesh], posed: PosedBody, body: Body) -> dict:
+    """The first body's layers after untangling, checked exactly."""
+    here = [m.with_vertices(m.vertices[0]) for m in layers]
+    done = untangle(here[::-1], Mesh(posed.mesh.vertices[0], body.faces))
+    return {"before": done.crossings, "after": len(done.left), "inside": done.inside, "clean": done.clean}
+
+
+def drape_ms(body: Body, draper: IspDraper, resolution: int = 128, rounds: int = 7) -> dict[str, float]:
+    """Median milliseconds a garment of each kind: one pose of a prepared garment, and preparing it."""
+    posed = body.pose(unseen_bodies(1, body, 1))
+    figures = {}
+    for kind in draper.nets:
+        (garment,) = unseen_garments(kind, 1, resolution, 3)
+        times: dict[str, list[float]] = {"": [], "_prepare": []}
+        for _ in range(rounds):
+            draper._kept.clear()
+            for part, run in (("_prepare", draper.prepare), ("", lambda g: draper.drape(g, posed))):
+                with torch.no_grad():
+                    began = time.perf_counter()
+                    run(garment)
+                    times[part].append((time.perf_counter() - began) * 1e3)
+        figures |= {kind + part: round(statistics.median(found), 1) for part, found in times.items()}
+        figures[f"{kind}_vertices"] = len(garment.mesh.vertices)
+    return figures
+
+
+def summary(rows: list[dict]) -> dict:
+    """Penetration and strain of each kind draped alone."""
+    out = {}
+    for kind in sorted({row["kind"] for row in rows}):
+        mine = [row for row in rows if row["kind"] == kind]
+        found: dict = {"drapes": len(mine)}
+        for way in ("network", "skinning"):
+            found[way] = {
+                "inside_pct": round(statistics.mean(row[way]["inside_pct"] for row in mine), 4),
+                "strain_joule": round(statistics.mean(row[way]["strain"] for row in mine), 4),
+            }
+        found["strain_ratio"] = round(found["network"]["strain_joule"] / found["skinning"]["strain_joule"], 4)
+        out[kind] = found
+    return out
+
+
+def measure(quick: bool, folder: Path | None = None, say=lambda line: None) -> dict:
+    """All figures; ``layer_intersection_pct`` and ``drape_ms`` are those that the benchmark of ISP reports.
+
+    Args:
+        quick: two bodies and one outfit of each table, coarse; else 200 bodies.
+        folder: with weights of your own; None = those that ship.
+        say: hears about progress.
+    """
+    size = QUICK if quick else FULL
+    body = load_body()
+    draper, layering = load_isp_draper(body, folder), load_layering(folder)
+    figures: dict = {"tables": {}, "pose_source": "held-out clip and random" if CLIP.is_file() else "random"}
+    rows: list[dict] = []
+    for kind, number in FIRST.items():
+        figures["tables"][number], found = layered(kind, size, body, draper, layering, say)
+        rows += found
+    if not quick:
+        for group in range(size.groups // 2):
+            posed = body.pose(unseen_bodies(size.bodies, body, 5000 + group))
+            rows += alone(unseen_garments("dress", 1, size.resolution, 5000 + group), posed, body, draper)
+    figures["alone"] = summary(rows)
+    figures["drape_ms"] = drape_ms(body, draper, rounds=3 if quick else 15)
+    tables = figures["tables"].values()
+    figures["layer_intersection_pct"] = {
+        "2": {way: round(statistics.mean(t[way]["two_layers"] for t in tables), 4) for way in ("with", "without")},
+        "5": {way: max(t[way]["worst_of_five"] for t in tables) for way in ("with", "without")},
+    }
+    return figures
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--weights", type=Path, default=None)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "isp-layers.json")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    began = time.perf_counter()
+    figures = measure(options.quick, options.weights, lambda line: print(line, flush=True))
+    figures |= {
+        "seconds": round(time.perf_counter() - began, 1),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {options.threads} threads",
+        "torch": torch.__version__,
+    }
+    if not options.quick:
+        options.out.write_text(json.dumps(figures, indent=1) + "\n")
+        options.out.with_suffix(".md").write_text(page(figures))
+    print(json.dumps(figures))
+
+
+def page(figures: dict) -> str:
+    """The figures as a page."""
+    lines = ["# Draping and layering by networks (ISP Tables 5 and 6)", ""]
+    lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
+    lines += ["| alone | drapes | inside the body, network | skinning | strain, network | skinning | ratio |"]
+    lines += ["|---|---|---|---|---|---|---|"]
+    for kind, f in figures["alone"].items():
+        n, s = f["network"], f["skinning"]
+        lines.append(
+            f"| {kind} | {f['drapes']} | {n['inside_pct']:.3f} % | {s['inside_pct']:.3f} % | "
+            f"{n['strain_joule']:.3f} J | {s['strain_joule']:.3f} J | {f['strain_ratio']:.2f} |"
+        )
+    lines.append("")
+    for kind, number in FIRST.items():
+        t = figures["tables"][number]
+        lines += [f"Table {number}: first layer a {kind}, {t['cases']} cases, % of the outer layer's area", ""]
+        for way, says in (("with", "with D_m"), ("forces", "forces alone"), ("without", "without")):
+            lines += [f"| {says} | 1 | 2 | 3 | 4 | 5 |", "|---|---|---|---|---|---|"]
+            for i, row in enumerate(t[way]["beneath_pct"]):
+                lines.append(
+                    f"| {i + 1} | " + " | ".join(f"{v:.3f}" if j >= i else "" for j, v in enumerate(row)) + " |"
+                )
+            lines.append("")
+        if "untangled" in t:
+            lines += [
+                f"After untangling nothing crosses in {t['untangled']['clean']} of {t['untangled']['cases']}.",
+                "",
+            ]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,256 @@
+"""Garments on a body: ``recon drape trousers:12 top:mean --pose walk.npz:40 --shape 1.2 -0.5 --out out/worn``.
+
+Each garment is draped alone, by a network or by skinning; the layering network moves each over those beneath it (ISP
+Algorithm 1); what still passes through the body, itself or another layer is drawn apart.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from pipelines.garment_source import load_garment
+from pipelines.pose_source import load_pose
+from recon.bodies import Body, load_body
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import Cloth, stvk
+from recon.cloth.intersections import self_intersections
+from recon.cloth.untangle import Untangled, untangle
+from recon.draping import DRAPERS, Draper, load_draper
+from recon.draping.isp import IspDraper
+from recon.draping.layering import Beneath, Layering, load_layering
+from recon.files.atomic import write_whole
+from recon.files.meshes import Colour, write_glb, write_obj
+from recon.files.weights import read_manifest
+from recon.metrics import beneath_pct, inside_pct, largest_stretch
+from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
+
+SKIN: Colour = (0.86, 0.69, 0.58)
+COLOURS: tuple[Colour, ...] = (
+    (0.27, 0.51, 0.76),
+    (0.80, 0.42, 0.36),
+    (0.38, 0.62, 0.43),
+    (0.72, 0.55, 0.80),
+    (0.85, 0.68, 0.32),
+)
+
+
+@dataclass(frozen=True)
+class Drape:
+    """Settings of ``recon drape``."""
+
+    garments: tuple[str, ...]
+    """What is worn, INNERMOST FIRST: KIND:NUMBER, KIND:mean, KIND:random:SEED, KIND:FILE.json, KIND:train:N,
+    KIND:test:N, or mesh files in the neutral T pose."""
+    pose: str = "a"
+    """t, a (arms lowered), stand, random:SEED, or a motion file (npz or bvh), of which FILE:FRAME takes a frame."""
+    shape: tuple[float, ...] = ()
+    """First coefficients of the body's shape, in deviations of the population; the rest are 0."""
+    out: Path = Path("out/drape")
+    """Folder for the results."""
+    draper: str = ""
+    """isp, skinning or another of the drapers; "" takes isp for garments with panels and skinning for other meshes."""
+    resolution: int = 128
+    """Cells of the grid that codes are cut on."""
+    layering: bool = True
+    """Move each garment over those beneath it (ISP Algorithm 1)."""
+    untangle: bool = True
+    """Draw apart what still passes through the body, itself or another layer."""
+    weights: Path | None = None
+    """Folder with weights of your own training; None takes the shipped ones."""
+
+
+@dataclass(frozen=True)
+class Draped:
+    """What came out."""
+
+    folder: Path
+    garments: dict[str, Garment | Mesh]
+    """Innermost first, as they lie on the body [m]."""
+    body: Mesh
+    """(V, 3) posed [m]."""
+    figures: dict
+    """As in ``result.json``."""
+
+
+def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
+    """Drape, layer, untangle, measure and write.
+
+    Raises:
+        UserError: unknown garment, pose or draper, too many shape coefficients, or a folder that holds other results.
+    """
+    _check(config)
+    names, seconds = _names(config.garments), dict[str, float]()
+
+    def timed(stage: str, began: float) -> None:
+        seconds[stage] = round(time.perf_counter() - began, 3)
+        say(f"{stage:<12} {seconds[stage]:6.2f} s")
+
+    at = time.perf_counter()
+    body = load_body()
+    things = [load_garment(name, config.resolution) for name in config.garments]
+    posed = body.pose(_worn_by(config, body))
+    timed("load", at)
+    at = time.perf_counter()
+    how, drapes = drape_each(things, posed, body, config)
+    timed("drape", at)
+    figures: dict = {"schema": 1, "what": "drape", "pose": config.pose, "shape": list(config.shape)}
+    if config.layering:
+        at = time.perf_counter()
+        trained = "layers-isp" in read_manifest(config.weights)
+        layering = load_layering(config.weights) if trained else Layering(None)
+        figures["layering"] = "network" if trained else "forces alone: no weights layers-isp"
+        drapes = layering(things, drapes, posed.mesh)
+        timed("layer", at)
+    layers = [mesh.with_vertices(mesh.vertices[0]) for mesh in drapes]
+    figures["before_untangling"] = measure(names, things, layers, posed, body)
+    if config.untangle:
+        at = time.perf_counter()
+        done = untangle(layers[::-1], Mesh(posed.mesh.vertices[0], body.faces))
+        moved = [torch.as_tensor(x).float() for x in done.vertices[::-1]]
+        layers = [mesh.with_vertices(x) for mesh, x in zip(layers, moved, strict=True)]
+        figures["untangle"] = _story(done)
+        timed("untangle", at)
+    figures["garments"] = measure(names, things, layers, posed, body)
+    for name, drawn in zip(names, how, strict=True):
+        figures["garments"][name]["draper"] = drawn
+    figures["seconds"] = seconds
+    worn: dict[str, Garment | Mesh] = {}
+    for name, thing, mesh in zip(names, things, layers, strict=True):
+        worn[name] = replace(thing, mesh=mesh) if isinstance(thing, Garment) else mesh
+    return _write(config, worn, Mesh(posed.mesh.vertices[0], body.faces), figures)
+
+
+def _check(config: Drape) -> None:
+    if not config.garments:
+        raise UserError("garments: found none; wanted at least one, innermost first")
+    if config.draper and config.draper not in DRAPERS:
+        raise UserError(f"--draper: found {config.draper!r}; wanted one of {', '.join(DRAPERS)}")
+    if not 16 <= config.resolution <= 1024:
+        raise UserError(f"--resolution: found {config.resolution}; wanted 16 to 1024")
+    if config.out.exists() and not _is_ours(config.out):
+        raise UserError(f"{config.out}: holds what is no drape's; wanted an empty folder (--out)")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder is empty or holds an earlier drape."""
+    if not folder.is_dir():
+        return False
+    try:
+        return not any(folder.iterdir()) or json.loads((folder / "result.json").read_text()).get("what") == "drape"
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _names(garments: Sequence[str]) -> list[str]:
+    """File names, each once."""
+    names: list[str] = []
+    for garment in garments:
+        name = Path(garment).stem if Path(garment).suffix else garment.replace(":", "-")
+        name = name.rpartition(":")[2]
+        count = sum(other == name or other.startswith(f"{name}_") for other in ("body", *names))
+        names.append(f"{name}_{count + 1}" if count else name)
+    return names
+
+
+def _worn_by(config: Drape, body: Body) -> BodyPose:
+    """One body of the wanted shape and pose."""
+    if len(config.shape) > body.n_shape:
+        raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
+    shape = torch.zeros(1, body.n_shape)
+    shape[0, : len(config.shape)] = torch.tensor(config.shape)
+    if not shape.isfinite().all():
+        raise UserError("--shape: found NaN or infinity; wanted numbers")
+    pose, place = load_pose(config.pose, body)
+    if place is None:  # on the floor
+        place = torch.zeros(1, 3)
+        place[0, 1] = -body.pose(BodyPose(shape, pose, place)).mesh.vertices[0, :, 1].min()
+    return BodyPose(shape, pose, place)
+
+
+@torch.no_grad()
+def drape_each(
+    things: Sequence[Garment | Mesh], posed: PosedBody, body: Body, config: Drape
+) -> tuple[list[str], list[Mesh]]:
+    """Each garment alone, (B, V, 3), and the name of the draper that did it."""
+    drapers: dict[str, Draper] = {}
+    how: list[str] = []
+    drapes: list[Mesh] = []
+    isp = load_draper("isp", body, config.weights) if config.draper in ("", "isp") else None
+    for name, thing in zip(config.garments, things, strict=True):
+        chosen = config.draper
+        known = isinstance(isp, IspDraper) and isp.knows(thing)
+        if chosen == "isp" and not known:
+            raise UserError(f"{name}: has no panels that draper isp knows; wanted --draper skinning, or {_PANELLED}")
+        chosen = chosen or ("isp" if known else "skinning")
+        if chosen not in drapers:
+            drapers[chosen] = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, config.weights)
+        garment = thing if isinstance(thing, Garment) else _bare(thing)
+        drapes.append(drapers[chosen].drape(garment, posed, under=drapes))
+        how.append(chosen)
+    return how, drapes
+
+
+_PANELLED = "a garment as KIND:CODE"
+
+
+def _bare(mesh: Mesh) -> Garment:
+    """A mesh without panels in a garment's place, for drapers that only look at the mesh."""
+    none = torch.zeros(0, dtype=torch.long)
+    return Garment("", mesh, torch.zeros(0, 2), none.view(0, 1).expand(0, 3), none, none, none)
+
+
+def measure(
+    names: Sequence[str], things: Sequence[Garment | Mesh], layers: Sequence[Mesh], posed: PosedBody, body: Body
+) -> dict[str, dict]:
+    """Figures of each garment, innermost first."""
+    contact = BodyContact(posed.mesh.vertices[0], body.faces)
+    beneath = [Beneath.of(m.vertices, m.faces) for m in layers]
+    figures: dict[str, dict] = {}
+    for k, (name, thing, mesh) in enumerate(zip(names, things, layers, strict=True)):
+        found = {
+            "vertices": len(mesh.vertices),
+            "inside_body_pct": round(inside_pct(mesh, contact), 4),
+            "vertices_inside_body": int(contact.penetrating(mesh.vertices).sum()),
+            "self_intersections": len(self_intersections(mesh.vertices, mesh.faces)),
+            "beneath_pct": {names[j]: round(beneath_pct(mesh, beneath[j]), 4) for j in range(k)},
+        }
+        if isinstance(thing, Garment):
+            worn = replace(thing, mesh=mesh)
+            stretch = largest_stretch(worn)
+            found |= {
+                "kind": thing.kind,
+                "stretch_p95": round(float(stretch.quantile(0.95)), 4),
+                "strain_joule": round(float(stvk(Cloth.from_garment(thing), mesh.vertices)), 4),
+            }
+        figures[name] = found
+    return figures
+
+
+def _story(done: Untangled) -> dict:
+    return {
+        "crossing_pairs_before": done.crossings,
+        "crossing_pairs_after": len(done.left),
+        "inside_body_after": done.inside,
+        "rounds": done.rounds,
+        "clean": done.clean,
+        "notes": list(done.notes),
+    }
+
+
+def _write(config: Drape, worn: dict[str, Garment | Mesh], body: Mesh, figures: dict) -> Draped:
+    """Meshes first, ``result.json`` last."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    for name, part in worn.items():
+        write_obj(part, config.out / f"{name}.obj", name)
+    write_obj(body, config.out / "body.obj", "body")
+    parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, SKIN)}
+    parts |= {name: (part, COLOURS[k % len(COLOURS)]) for k, (name, part) in enumerate(worn.items())}
+    write_glb(parts, config.out / "scene.glb")
+    write_whole(config.out / "result.json", json.dumps(figures, indent=1) + "\n")
+    return Draped(config.out, worn, body, figures)

@@ -1,0 +1,76 @@
+"""Garments to learn draping on: many of a kind, coarse, ready for physics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon.bodies import Body
+from recon.cloth.energies import Cloth
+from recon.cloth.frames import FramePhysics, FrameWeights
+from recon.cloth.inextensible import OneRings
+from recon.garments import WAISTED, GarmentDecoder, load_decoder
+from recon.garments.latents import spread
+from recon.garments.panels import waistband
+from recon.types import Garment, Mesh
+
+NEIGHBOURS = 8
+"""A code between two others is drawn between one and one of its so many nearest: clean garments, all of them new."""
+
+
+def between(codes: Tensor, generator: torch.Generator) -> Tensor:
+    """A random code (z,) on the way between two neighbouring learned ones (n, z)."""
+    one = codes[int(torch.randint(len(codes), (), generator=generator))]
+    near = (codes - one).square().sum(1).topk(min(NEIGHBOURS + 1, len(codes)), largest=False).indices[1:]
+    other = codes[near[int(torch.randint(len(near), (), generator=generator))]] if len(near) else one
+    share = torch.rand((), generator=generator)
+    return one + share * (other - one)
+
+
+def garments_of(decoder: GarmentDecoder, count: int, resolution: int, generator: torch.Generator) -> list[Garment]:
+    """``count`` garments: half of them learned codes that are far from each other, the others between learned ones."""
+    learned = [decoder.codes[k] for k in spread(decoder.codes, (count + 1) // 2)]
+    codes = learned + [between(decoder.codes, generator) for _ in range(count - len(learned))]
+    with torch.no_grad():
+        return [decoder.decode(code, resolution) for code in codes]
+
+
+def resolution_for(decoder: GarmentDecoder, vertices: int) -> int:
+    """Cells of the grid that cut the mean garment into about so many vertices."""
+    with torch.no_grad():
+        found = len(decoder.decode(decoder.codes.mean(0), 64).mesh.vertices)
+    return max(16, round(64 * (vertices / found) ** 0.5))
+
+
+@dataclass(frozen=True)
+class Wardrobe:
+    """Garments of one kind with their physics, all on the same posed bodies."""
+
+    garments: list[Garment]
+    cloths: list[Cloth]
+    physics: list[FramePhysics]
+    held: list[Tensor]
+    """Vertices of each waistband, empty where nothing holds it."""
+
+    @classmethod
+    def of(cls, garments: list[Garment], body: Body, weights: FrameWeights, frames: int) -> Wardrobe:
+        """``frames``: bodies at a time."""
+        rest = Mesh(body.rest(body.neutral().shape).vertices[0], body.faces)
+        cloths = [Cloth.from_garment(g) for g in garments]
+        rings = [OneRings.of(g.mesh.vertices, g.mesh.faces) for g in garments]
+        first = FramePhysics(cloths[0], rings[0], rest, weights, frames)
+        physics = [first, *(first.dressed(c, r) for c, r in zip(cloths[1:], rings[1:], strict=True))]
+        none = torch.zeros(0, dtype=torch.long)
+        held = [torch.as_tensor(waistband(g)) if g.kind in WAISTED else none for g in garments]
+        return cls(garments, cloths, physics, held)
+
+    @classmethod
+    def decoded(
+        cls, kind: str, count: int, vertices: int, body: Body, weights: FrameWeights, frames: int, seed: int
+    ) -> Wardrobe:
+        """``count`` garments of a kind's shipped decoder, of about so many vertices."""
+        decoder = load_decoder(kind)
+        generator = torch.Generator().manual_seed(seed)
+        return cls.of(garments_of(decoder, count, resolution_for(decoder, vertices), generator), body, weights, frames)

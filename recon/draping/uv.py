@@ -1,0 +1,136 @@
+"""Functions over the plane of a garment's panels, front and back: what ISP's draping networks read and write.
+
+Panels of one kind of garment share a plane (``Garment.panel_points``), so a map over it, one for the front panel and
+one for the back, says something at every point of any garment of the kind, whatever its mesh (ISP §3.2).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon.types import Garment
+
+COARSE = 150.0
+"""Eigenvalue [1/m²] of waves half a metre long: as smooth as cloth on a body mostly is."""
+FLAT_SCALE = 5.0
+"""Factor that brings the distance between panel and body [m] to about one."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """The part of the panels' plane that maps cover."""
+
+    low: tuple[float, float]
+    """x and y of its lower corner, panel coordinates [m]."""
+    high: tuple[float, float]
+    """x and y of its upper corner [m]."""
+
+    @classmethod
+    def around(cls, points: Tensor, margin: float = 0.05) -> Box:
+        """The box of panel points (P, 2), symmetric in x, ``margin`` [m] wider on each side."""
+        half = float(points[:, 0].abs().max()) + margin
+        y = points[:, 1]
+        return cls((-half, float(y.min()) - margin), (half, float(y.max()) + margin))
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height [m]."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+    def unit(self, points: Tensor) -> Tensor:
+        """Panel points (..., 2) [m] -> the unit square; points outside go to its border."""
+        low, size = points.new_tensor(self.low), points.new_tensor(self.size)
+        return ((points - low) / size).clamp(0, 1)
+
+
+def modes(box: Box, count: int) -> Tensor:
+    """(M, 2) half waves along x and y of the ``count`` smoothest cosines over a box, smoothest first."""
+    width, height = box.size
+    most = 2 * math.ceil(math.sqrt(count * max(width / height, height / width)))
+    i, j = (k.flatten() for k in torch.meshgrid(torch.arange(most), torch.arange(most), indexing="ij"))
+    order = torch.argsort((i / width) ** 2 + (j / height) ** 2, stable=True)[:count]
+    return torch.stack([i[order], j[order]], 1)
+
+
+def basis(box: Box, which: Tensor, points: Tensor) -> Tensor:
+    """(P, M) the cosines ``which`` (M, 2) at panel points (P, 2), fine ones scaled down.
+
+    Stretching costs a wave its eigenvalue: divided by the root of it, all coefficients are about as stiff, and learning
+    is not held up by the finest.
+    """
+    at = math.pi * box.unit(points)
+    waves = [torch.cos(at[:, k, None] * torch.arange(int(which[:, k].max()) + 1).to(at)) for k in (0, 1)]
+    frequency = math.pi * which / torch.tensor(box.size)
+    level = torch.where(which > 0, 2**0.5, 1.0).prod(1) / (1 + frequency.square().sum(1) / COARSE).sqrt()
+    return waves[0][:, which[:, 0]] * waves[1][:, which[:, 1]] * level.to(at)
+
+
+def panel_of_point(garment: Garment) -> Tensor:
+    """(P,) long, 0 for points of the front panel, 1 for those of the back panel."""
+    panel = torch.zeros(len(garment.panel_points), dtype=torch.long, device=garment.panel_faces.device)
+    panel[garment.panel_faces[garment.panel_of_face == 1].flatten()] = 1
+    return panel
+
+
+@dataclass(frozen=True)
+class Welding:
+    """How points of the panels make vertices: a vertex at a seam is the mean of its points."""
+
+    vertex_of_point: Tensor
+    """(P,)."""
+    share: Tensor
+    """(V, 1) one over the number of points of each vertex."""
+
+    @classmethod
+    def of(cls, garment: Garment) -> Welding:
+        """From a garment's panels."""
+        count = torch.bincount(garment.vertex_of_point, minlength=garment.mesh.vertices.shape[-2])
+        return cls(garment.vertex_of_point, 1 / count.clamp_min(1).to(garment.mesh.vertices)[:, None])
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """(..., P, C) at panel points -> (..., V, C) at vertices."""
+        out = values.new_zeros(*values.shape[:-2], len(self.share), values.shape[-1])
+        return out.index_add(-2, self.vertex_of_point, values) * self.share.to(values)
+
+
+def point_areas(garment: Garment) -> Tensor:
+    """(P,) a third of the flat triangles around each panel point [m²]."""
+    a, b, c = garment.panel_points[garment.panel_faces].unbind(1)
+    u, v = b - a, c - a
+    area = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).abs() / 6
+    return area.new_zeros(len(garment.panel_points)).index_add(
+        0, garment.panel_faces.flatten(), area.repeat_interleave(3)
+    )
+
+
+def splat(box: Box, cells: tuple[int, int], points: Tensor, panel: Tensor, values: Tensor) -> Tensor:
+    """Sums of values (P, C) at panel points, spread over the nearest nodes: (2, nx, ny, C), differentiable in all."""
+    nx, ny = cells
+    at = box.unit(points) * points.new_tensor([nx - 1, ny - 1])
+    base = torch.minimum(at.detach().floor(), points.new_tensor([nx - 2, ny - 2])).clamp_min(0)
+    part = at - base
+    first = (panel * nx + base[:, 0].long()) * ny + base[:, 1].long()
+    out = values.new_zeros(2 * nx * ny, values.shape[1])
+    for dx in (0, 1):
+        for dy in (0, 1):
+            share = (part[:, 0] if dx else 1 - part[:, 0]) * (part[:, 1] if dy else 1 - part[:, 1])
+            out = out.index_add(0, first + dx * ny + dy, share[:, None] * values)
+    return out.view(2, nx, ny, -1)
+
+
+def rest_features(garment: Garment, box: Box, cells: tuple[int, int]) -> Tensor:
+    """(2 nx ny 4,) where the panels are and how far the cloth at rest is from their plane; hardly depends on the mesh.
+
+    What ISP's code says about a garment, read off the garment itself: a draping network that knows it needs no code,
+    and keeps its meaning when a decoder is trained anew.
+    """
+    points, area = garment.panel_points, point_areas(garment)
+    away = garment.mesh.vertices[garment.vertex_of_point]
+    away = FLAT_SCALE * torch.cat([away[:, :2] - points, away[:, 2:]], 1)
+    node = box.size[0] * box.size[1] / ((cells[0] - 1) * (cells[1] - 1))
+    values = torch.cat([torch.ones_like(away[:, :1]), away], 1) * (area / node)[:, None]
+    return splat(box, cells, points, panel_of_point(garment), values).flatten()
