@@ -95,13 +95,23 @@ def _show_drape(drape: Callable[..., Any], config: Any) -> int:
     return OK
 
 
+def _show_figures(run: Callable[..., Any], config: Any) -> int:
+    """Progress on stderr, the figures as JSON on stdout."""
+    from pipelines.progress import Progress
+
+    with Progress() as progress:
+        came = run(config, tick=progress.tick)
+    print(json.dumps(came, indent=1))
+    return OK
+
+
 COMMANDS = {
     "photo": Command("fit the garments of a photo", "pipelines.photo", "PhotoFit", "fit_photo", _show_photo, "photo"),
     "scan": Command("fit the garments of a labelled scan", "pipelines.scan", "ScanFit", "fit_scan", _show_scan, "scan"),
     "animate": Command(
         "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
     ),
-    "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", words="what"),
+    "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", _show_figures, "what"),
     "drape": Command("dress a body in garments", "pipelines.drape", "Drape", "drape", _show_drape, "garments"),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),

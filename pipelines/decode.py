@@ -1,14 +1,20 @@
-"""From a code to a garment file: ``recon decode top 12 --resolution 256 --out top.obj``."""
+"""From a code to a garment file: ``recon decode top 12 --resolution 256 --out top.obj``.
+
+Instead of a code, evidence of the garment may be given: ``recon decode top --fit scan.ply --out top.obj`` searches the
+code whose garment explains a mesh, a point cloud or a silhouette.
+"""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from pipelines.fit_code import CodeFit, find_code
 from pipelines.garment_source import latent_of
 from recon.files.codes import write_code
 from recon.files.meshes import write_mesh
@@ -26,7 +32,8 @@ class Decode:
     """Settings of ``recon decode``."""
 
     what: tuple[str, ...]
-    """KIND and CODE: top, skirt, trousers or dress; a learned code's number, mean, random:SEED or a code file."""
+    """KIND and CODE: top, skirt, trousers or dress; a learned code's number, mean, random:SEED or a code file. With
+    ``fit`` the KIND alone."""
     out: Path
     """File to write: .obj (keeps the panels as texture coordinates [m]), .ply or .glb."""
     resolution: int = 256
@@ -37,20 +44,48 @@ class Decode:
     """Folder of your own weights; None = those that ship."""
     code: Path | None = None
     """Also write the code to this .json file, which commands take as CODE."""
+    fit: Path | None = None
+    """Evidence to find the code from: a mesh (obj, ply, stl, off, glb) or points (ply, npy, xyz, txt), at rest on the
+    neutral body in metres; or the garment's silhouette (png, jpg) as the neutral body wears it, seen by the camera of
+    ``pipelines.fit_evidence.front_camera``."""
+    search: CodeFit = field(default_factory=CodeFit)
+    """How the code is searched."""
 
 
-def decode(config: Decode) -> dict:
-    """Decode, write, and return the figures: vertices, faces, open borders and the time [ms].
+def decode(config: Decode, tick: Callable[[int, float], None] | None = None) -> dict:
+    """Decode, write, and return the figures: vertices, faces, open borders and the time [ms]; of a fit, how near it is.
 
     Raises:
-        UserError: no such kind, code or format, or a resolution out of range; nothing is written then.
+        UserError: no such kind, code or format, a resolution out of range, or evidence that can't be read; nothing is
+            written then.
     """
-    if len(config.what) != 2:
-        raise UserError(f"decode: found {' '.join(config.what)!r}; wanted KIND CODE, such as top mean")
-    kind, name = config.what
+    wanted = 2 if config.fit is None else 1
+    if len(config.what) != wanted:
+        form = "KIND CODE, such as top mean" if wanted == 2 else "KIND alone with --fit"
+        raise UserError(f"decode: found {' '.join(config.what)!r}; wanted {form}")
     check(config.out, config.resolution)
-    decoder = load_decoder(kind, config.decoder, folder=config.weights)
-    return finish(decoder, latent_of(decoder, name), config.resolution, config.out, config.code)
+    if config.fit is not None and config.fit.exists() and config.out.exists() and config.fit.samefile(config.out):
+        raise UserError(f"{config.out}: is the evidence; wanted another file to write")
+    decoder = load_decoder(config.what[0], config.decoder, folder=config.weights)
+    if config.fit is None:
+        return finish(decoder, latent_of(decoder, config.what[1]), config.resolution, config.out, config.code)
+    return _fitted(config, decoder, config.fit, tick)
+
+
+def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[int, float], None] | None) -> dict:
+    from pipelines.fit_evidence import Bank, evidence_of
+    from recon.garments.isp import IspDecoder
+
+    if not isinstance(decoder, IspDecoder):
+        raise UserError(f"decoder: found {config.decoder}; --fit wanted isp")
+    evidence = evidence_of(decoder, fit, config.search.seed)
+    begun = time.perf_counter()
+    found = find_code(decoder, evidence, evidence.starts(Bank.of(decoder)), config.search, tick)
+    spent = time.perf_counter() - begun
+    said = finish(decoder, found.latent, config.resolution, config.out, config.code)
+    evidence.renew(found.latent)
+    figures = {k: round(v, 3) for k, v in evidence.figures(found.latent).items()}
+    return {**said, **figures, "search_s": round(spent, 1), "starts": list(found.starts)}
 
 
 def check(out: Path, resolution: int) -> None:

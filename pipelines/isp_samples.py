@@ -39,6 +39,23 @@ class Border:
 
 
 @dataclass(frozen=True)
+class Outline:
+    """Border edges of one flat panel that was never sewn, domain units."""
+
+    start: NDArray[np.float64]
+    """(E, 2)."""
+    end: NDArray[np.float64]
+    label: NDArray[np.int64]
+    """(E,) 0 = open."""
+    loops: list[Polygon]
+
+    @property
+    def weight(self) -> NDArray[np.float64]:
+        """(E,) how often to sample: length."""
+        return np.linalg.norm(self.end - self.start, axis=1)
+
+
+@dataclass(frozen=True)
 class IspSamples:
     """All garments' samples, ready to be drawn from; domain units throughout."""
 
@@ -198,7 +215,7 @@ def _inside(loops: list[Polygon], points: NDArray) -> NDArray:
     return found
 
 
-def signed_distance(border: Border, at: NDArray) -> tuple[NDArray, NDArray]:
+def signed_distance(border: Border | Outline, at: NDArray) -> tuple[NDArray, NDArray]:
     """(N,) exact signed distance, negative inside, and label of the closest border edge, at points (N, 2)."""
     start = torch.as_tensor(border.start, dtype=torch.float32)
     along_edge = torch.as_tensor(border.end - border.start, dtype=torch.float32)
@@ -217,10 +234,15 @@ def signed_distance(border: Border, at: NDArray) -> tuple[NDArray, NDArray]:
 
 def along(border: Border, rng: np.random.Generator, count: int) -> tuple[NDArray, NDArray]:
     """Weighted random border points (count, 2) with their places in space (count, 3)."""
+    edge, t, flat = on_border(border, rng, count)
+    return flat, border.start_3d[edge] + t * (border.end_3d[edge] - border.start_3d[edge])
+
+
+def on_border(border: Border | Outline, rng: np.random.Generator, count: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Weighted random border points: their edges (count,), places along these (count, 1), and points (count, 2)."""
     edge = rng.choice(len(border.weight), size=count, p=border.weight / border.weight.sum())
     t = rng.random((count, 1))
-    flat = border.start[edge] + t * (border.end[edge] - border.start[edge])
-    return flat, border.start_3d[edge] + t * (border.end_3d[edge] - border.start_3d[edge])
+    return edge, t, border.start[edge] + t * (border.end[edge] - border.start[edge])
 
 
 def _around(border: Border, rng: np.random.Generator, count: int = 5120) -> NDArray:

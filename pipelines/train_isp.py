@@ -66,6 +66,8 @@ class TrainIsp:
     """Adam's learning rate of the networks at the start; decays along a cosine."""
     code_rate: float = 2e-3
     """The same for the codes."""
+    code_noise: float = 0.0
+    """Noise on the codes as a share of their spread, falling to a third: between codes must lie clothes as well."""
     width: int = 192
     """Units per layer."""
     pattern_depth: int = 4
@@ -131,7 +133,9 @@ def learn(
             learned.codes.copy_(known_codes(earlier, samples))
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
-    training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(learned, samples, config, generator))
+    training.run(
+        Budget(config.minutes, config.steps), lambda share: batch_loss(learned, samples, config, generator, share)
+    )
     known = parameters or [{}] * len(garments)
     variants = [Variant(g.variant, dict(p)) for g, p in zip(garments, known, strict=True)]
     return IspDecoder(learned.nets, learned.codes.detach().clone(), variants), training
@@ -181,11 +185,14 @@ def first_codes(samples: IspSamples, size: int) -> Tensor:
 
 
 def batch_loss(
-    learned: Learned, samples: IspSamples, config: TrainIsp, generator: torch.Generator
+    learned: Learned, samples: IspSamples, config: TrainIsp, generator: torch.Generator, share: float = 0.0
 ) -> tuple[Tensor, dict[str, float]]:
-    """The loss of a random batch, and its terms in millimetres or natural units."""
+    """The loss of a random batch, ``share`` of the budget spent, and its terms in millimetres or natural units."""
     garments = torch.randperm(len(samples), generator=generator)[: config.batch]
     z = learned.codes[garments]
+    if config.code_noise:
+        size = config.code_noise * (1 - share * 2 / 3) * learned.codes.detach().std(0).square().mean().sqrt()
+        z = z + size * torch.randn(z.shape, generator=generator)
     surface, measured = surface_loss(learned.nets, z, samples, garments, config, generator)
     pattern, more = pattern_loss(learned.nets, z, samples, garments, config.pattern_points, generator)
     loss = surface + pattern + 1e-4 * z.square().sum(1).mean()

@@ -40,6 +40,19 @@ def read_masks(
     return _checked(masks, garments)
 
 
+def read_mask(path: str | Path) -> Tensor:
+    """(h, w) bool: what is opaque in one image that has transparency, else what is bright.
+
+    Raises:
+        UserError: missing, no image, or fewer than ``MIN_PIXELS`` pixels in or out of the mask.
+    """
+    mask = torch.as_tensor(_binary(_read_image(Path(path))))
+    inside = int(mask.sum())
+    if min(inside, mask.numel() - inside) < MIN_PIXELS:
+        raise UserError(f"{path}: {inside} of {mask.numel()} pixels are in the mask; wanted a garment's silhouette")
+    return mask
+
+
 def parse_labels(labels: str | Sequence[str] | None) -> dict[int, str]:
     """``1=top,2=trousers`` (or a list of such items) -> {1: "top", 2: "trousers"}."""
     items = labels.split(",") if isinstance(labels, str) else [p for item in labels or () for p in item.split(",")]

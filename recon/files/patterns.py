@@ -53,6 +53,8 @@ class Piece:
     """Closed outlines (N, 2) [mm], page axes: the outer one and holes; the last point joins the first."""
     runs: list[Run]
     """What each stretch of the outlines is."""
+    origin: tuple[float, float] = (0.0, 0.0)
+    """Where the panel coordinates' origin lies on the page [mm]."""
 
     @property
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -225,7 +227,7 @@ def _lay_out(panels: list[list[Piece]]) -> tuple[list[Piece], tuple[float, float
         shift = np.array([left, 2 * MARGIN]) - low
         for piece in pieces:
             runs = [Run(run.label, run.points + shift, run.vertices) for run in piece.runs]
-            placed.append(Piece(piece.name, [loop + shift for loop in piece.loops], runs))
+            placed.append(Piece(piece.name, [loop + shift for loop in piece.loops], runs, (shift[0], shift[1])))
         left += float(high[0] - low[0]) + 3 * MARGIN
         height = max(height, float(high[1] - low[1]))
     return placed, (left - MARGIN, height + 4 * MARGIN)
@@ -237,7 +239,7 @@ def _draw(
     """One piece as an SVG group; ``size`` is the text's height [mm]."""
     line = size / 12
     outline = " ".join("M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in loop) + "Z" for loop in piece.loops)
-    parts = [f'<path class="cut" stroke-width="{line:.2f}" d="{outline}"/>']
+    parts = [f'<path id="cut-{piece.name.replace(" ", "-")}" class="cut" stroke-width="{line:.2f}" d="{outline}"/>']
     for run in piece.runs:
         kind = "seam" if run.label > 0 else "open"
         course = "M" + "L".join(f"{x:.3f} {y:.3f}" for x, y in run.points)
@@ -251,7 +253,12 @@ def _draw(
         parts.append(_label(text, middle, outward, size, kind))
     low, high = piece.box
     parts.append(_grain(piece, low, high, size, line))
-    return f'<g class="piece" data-name="{escape(piece.name)}">\n' + "\n".join(parts) + "\n</g>"
+    x, y = piece.origin
+    return (
+        f'<g class="piece" data-name="{escape(piece.name)}" data-origin="{x:.3f} {y:.3f}">\n'
+        + "\n".join(parts)
+        + "\n</g>"
+    )
 
 
 def _middle(run: Run, piece: Piece) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
