@@ -29,6 +29,8 @@ class Resting:
     """Steps between two searches for contact."""
     memory: int = 20
     """Pairs that L-BFGS keeps."""
+    friction: float = 0.0
+    """Coulomb's coefficient between cloth and body; cloth sticks where it first touches until that gives way."""
     contact: PolishSettings = field(default_factory=PolishSettings)
     """Distance kept from the body, and how stiff that is."""
 
@@ -46,7 +48,8 @@ class Rested:
     iterations: int
     """An upper bound of the steps taken."""
     energies: tuple[float, ...]
-    """Energy at the start and after each search for contact, with the contacts found there [J]."""
+    """Energy at the start and after each search for contact, with the contacts found there [J]; friction, which spends
+    energy, aside."""
     converged: bool
     """Whether the residual met the tolerance."""
 
@@ -79,11 +82,12 @@ def rest(
         gradient[held] = 0
         return value, gradient
 
+    touch = _Touch(energy, body, s, cloth.masses.numpy() * GRAVITY)
     done, energies, residual = 0, [], np.inf
     while done < s.iterations:
-        touching = _touch(energy, x, body, s.contact)
+        touching, spent = touch(x)
         value, gradient = free(x)
-        energies.append(value)
+        energies.append(value - spent)
         residual = float(np.abs(gradient).max(initial=0.0)) / weight
         if residual <= s.tolerance:
             break
@@ -102,16 +106,52 @@ def rest(
     return Rested(x, energies[-1], residual, done, tuple(energies), residual <= s.tolerance)
 
 
-def _touch(energy: ElasticEnergy, x: NDArray, body: BodyContact | None, s: PolishSettings) -> NDArray:
-    """Set the planes of the body near the cloth; (V,) 1 where it touches."""
-    touching = np.zeros(len(x))
-    if body is None:
-        return touching
-    face, weights, sign = (t.numpy() for t in body.closest(torch.from_numpy(x)))
-    on = (body.vertices.detach().numpy()[body.faces.numpy()[face]] * weights[..., None]).sum(1)
-    away = (x - on) * sign[:, None]
-    distance = np.linalg.norm(away, axis=1)
-    near = np.flatnonzero((distance < s.reach) & (distance > 1e-9))
-    energy.touch(Contacts(vertex=near, point=on[near], normal=away[near] / distance[near, None]), s)
-    touching[(distance < 1.5 * s.offset) | (sign < 0)] = 1
-    return touching
+class _Touch:
+    """The body's planes near the cloth, searched anew at each call; with friction, what each vertex sticks to."""
+
+    def __init__(self, energy: ElasticEnergy, body: BodyContact | None, settings: Resting, weight: NDArray):
+        """``weight`` (V,) of each vertex [N]."""
+        self.energy, self.body, self.settings, self.weight = energy, body, settings, weight
+        self.anchor = np.full((len(weight), 3), np.nan)
+
+    def __call__(self, x: NDArray) -> tuple[NDArray, float]:
+        """(V,) 1 where cloth at ``x`` (V, 3) touches, and the energy that friction would give back [J]."""
+        s = self.settings.contact
+        touching = np.zeros(len(x))
+        if self.body is None:
+            return touching, 0.0
+        face, weights, sign = (t.numpy() for t in self.body.closest(torch.from_numpy(x)))
+        on = (self.body.vertices.detach().numpy()[self.body.faces.numpy()[face]] * weights[..., None]).sum(1)
+        away = (x - on) * sign[:, None]
+        distance = np.linalg.norm(away, axis=1)
+        near = np.flatnonzero((distance < s.reach) & (distance > 1e-9))
+        normal, depth = away[near] / distance[near, None], s.offset - sign[near] * distance[near]
+        touching[(distance < 1.5 * s.offset) | (sign < 0)] = 1
+        if not self.settings.friction:
+            self.energy.touch(Contacts(vertex=near, point=on[near], normal=normal), s)
+            return touching, 0.0
+        first = np.argsort(depth < -s.slip, kind="stable")  # those that touch come first
+        near, normal, depth = near[first], normal[first], depth[first]
+        stuck = int((depth >= -s.slip).sum())
+        grip, spent = self._stick(x, near[:stuck], normal[:stuck], depth[:stuck])
+        anchor = self.anchor[near[:stuck]]
+        self.energy.touch(Contacts(vertex=near, point=on[near], normal=normal, anchor=anchor, grip=grip), s)
+        return touching, spent
+
+    def _stick(self, x: NDArray, vertex: NDArray, normal: NDArray, depth: NDArray) -> tuple[NDArray, float]:
+        """(A,) how hard each touching vertex is held, its anchor dragged along where it slid; friction's energy."""
+        slip = self.settings.contact.slip
+        loose = np.ones(len(x), bool)
+        loose[vertex] = False
+        self.anchor[loose] = np.nan
+        new = vertex[np.isnan(self.anchor[vertex, 0])]
+        self.anchor[new] = x[new]
+        along = x[vertex] - self.anchor[vertex]
+        along -= normal * (along * normal).sum(1, keepdims=True)
+        way = np.linalg.norm(along, axis=1)
+        slid = way > slip
+        self.anchor[vertex[slid]] += along[slid] * (1 - slip / way[slid, None])
+        # What only just arrived is not pressed down yet: it counts with its weight.
+        pressed = np.maximum(2 * self.settings.contact.stiffness * depth, self.weight[vertex] * normal[:, 1].clip(0))
+        grip = self.settings.friction * pressed
+        return grip, float((grip * np.minimum(way, slip) ** 2).sum() / (2 * slip))

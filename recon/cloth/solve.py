@@ -40,6 +40,8 @@ class PolishSettings:
     """Vertices closer than this to the body can come in contact during a round [m]."""
     stiffness: float = 8e3
     """Stiffness of all contacts and holds [N/m per vertex]."""
+    slip: float = 2e-4
+    """Way over which friction builds up [m]: what it holds creeps by less than this."""
     apart: float = 0.006
     """Distance that vertices far apart in the pattern keep [m]."""
     middle: float = 0.001
@@ -61,6 +63,10 @@ class Contacts:
     """(K, 3) a point of each plane [m]."""
     normal: NDArray = _rows(3)
     """(K, 3) unit normals: the side where the vertex belongs."""
+    anchor: NDArray = _rows(3)
+    """(A, 3) where friction would hold the first A of those vertices [m]; none: they slide freely."""
+    grip: NDArray = _rows(0)
+    """(A,) the most that it holds each with: its coefficient times the normal force [N]."""
     pair: NDArray = _rows(2, int)
     """(P, 2) vertices kept apart."""
     apart: NDArray = _rows(0)
@@ -83,6 +89,9 @@ class _Contacts:
     vertex: wp.array(dtype=int)
     point: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3d)
+    anchor: wp.array(dtype=wp.vec3d)
+    grip: wp.array(dtype=wp.float64)
+    slip: wp.float64
     pair: wp.array(dtype=wp.vec2i)
     apart: wp.array(dtype=wp.float64)
     over: wp.array(dtype=wp.vec4i)
@@ -111,6 +120,17 @@ def _evaluate(
         if depth > wp.float64(0.0):
             total += c.stiffness * depth * depth
             g[i] = g[i] - c.normal[k] * (two * c.stiffness * depth)
+    for k in range(c.anchor.shape[0]):
+        i = c.vertex[k]
+        along = x[i] - c.anchor[k]
+        along = along - c.normal[k] * wp.dot(along, c.normal[k])
+        way = wp.length(along)
+        if way < c.slip:
+            total += c.grip[k] * way * way / (two * c.slip)
+            g[i] = g[i] + along * (c.grip[k] / c.slip)
+        else:
+            total += c.grip[k] * (way - wp.float64(0.5) * c.slip)
+            g[i] = g[i] + along * (c.grip[k] / way)
     for k in range(c.pair.shape[0]):
         p = c.pair[k]
         away = x[p[0]] - x[p[1]]
@@ -156,6 +176,8 @@ class ElasticEnergy:
         c = _Contacts()
         c.vertex = wp.array(contacts.vertex.astype(np.int32), dtype=int, device=DEVICE)
         c.point, c.normal = doubles(contacts.point, wp.vec3d), doubles(contacts.normal, wp.vec3d)
+        c.anchor, c.grip = doubles(contacts.anchor, wp.vec3d), doubles(contacts.grip, wp.float64)
+        c.slip = s.slip
         c.pair = wp.array(contacts.pair.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
         c.apart = doubles(contacts.apart, wp.float64)
         c.over = wp.array(contacts.over.astype(np.int32), dtype=wp.vec4i, device=DEVICE)

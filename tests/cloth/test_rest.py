@@ -11,6 +11,7 @@ from sheets import sheet
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import GRAVITY, Cloth, Fabric
 from recon.cloth.rest import Resting, rest
+from recon.cloth.solve import PolishSettings
 
 
 def hanging(cells: int) -> tuple[Cloth, np.ndarray, np.ndarray]:
@@ -64,3 +65,29 @@ def test_cloth_on_a_ball_stays_outside_and_hangs() -> None:
     assert found.energy < found.energies[0]
     middle = np.abs(flat[:, :2] - 0.35).sum(1).argmin()
     assert found.x[middle, 1] == pytest.approx(0.2035, abs=2e-3)  # it lies on top
+
+
+def tilted(angle: float) -> tuple[Cloth, np.ndarray, BodyContact, np.ndarray]:
+    """A small sheet lying just over a large plane that falls by ``angle`` [rad] along x; last, the way down."""
+    made = sheet(6, 6, 0.1, 0.1)
+    flat = made.mesh.vertices.numpy() - [0.05, 0.05, 0.0]
+    down, up = np.array([np.cos(angle), -np.sin(angle), 0]), np.array([np.sin(angle), np.cos(angle), 0])
+    across = np.cross(down, up)
+    corners = np.array([-down - across, -down + across, down + across, down - across]) * 5
+    plane = BodyContact(torch.as_tensor(corners), torch.tensor([[0, 1, 2], [0, 2, 3]]))
+    assert float(plane.signed_distance(torch.as_tensor(up[None]))[0]) > 0
+    x = flat[:, :1] * down + flat[:, 1:2] * -across + 0.0034 * up
+    return Cloth.from_garment(made), x, plane, down
+
+
+def test_friction_holds_cloth_on_a_slope_as_coulomb_says() -> None:
+    """On a plane of angle a cloth slides if and only if tan a > mu; held, it creeps by slip tan a / mu."""
+    cloth, x, plane, down = tilted(np.arctan(0.5))
+    soft = PolishSettings(stiffness=1.0)  # as soft as friction, or sliding takes for ever
+    held = rest(cloth, x, body=plane, settings=Resting(tolerance=0.01, search=20, friction=0.6, contact=soft))
+    assert held.converged
+    crept = ((held.x - x) @ down).mean()
+    assert crept == pytest.approx(soft.slip * 0.5 / 0.6, rel=0.1)
+    slid = rest(cloth, x, body=plane, settings=Resting(tolerance=0.01, iterations=400, friction=0.4, contact=soft))
+    assert not slid.converged
+    assert ((slid.x - x) @ down).mean() > 10 * crept
