@@ -61,7 +61,7 @@ def table1(
     }
     if draw_apart:
         done, how = untangled([part], posed, body)
-        row["untangled"] = measure(done[0], posed, body) | how | {"frames": len(x)}
+        row["untangled"] = measure(Moving(draper.garment, done[0]), posed, body) | how | {"frames": len(x)}
     return row
 
 

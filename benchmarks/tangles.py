@@ -94,10 +94,10 @@ def displaced(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
 
 
 def smooth_noise(x: torch.Tensor, rng: np.random.Generator, waves: int = 24) -> torch.Tensor:
-    """(V, 3) displacements of unit size with wavelengths from 8 to 40 cm."""
+    """(V, 3) displacements of unit size with wavelengths from 20 to 60 cm."""
     direction = rng.normal(size=(waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    frequency = 2 * np.pi / rng.uniform(0.08, 0.4, waves)
+    frequency = 2 * np.pi / rng.uniform(0.2, 0.6, waves)
     phase = x.double().numpy() @ (direction * frequency[:, None]).T + rng.uniform(0, 2 * np.pi, waves)
     field = np.sin(phase) @ rng.normal(size=(waves, 3)) / np.sqrt(waves / 2)
     return torch.from_numpy(field).float()

@@ -2,6 +2,7 @@
 
 Each garment is draped over the whole motion, by its GAPS network, by simulation or by skinning; then, frame by frame,
 what passes through the body, through itself or through another layer is drawn apart, and everything is written.
+Interrupted, the same command goes on: each garment, and every ``CHUNK`` frames of untangling, is a stage of a ``Run``.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pipelines.garment_source import load_garment
+from pipelines.run import Run
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
@@ -28,6 +30,7 @@ from recon.draping.skinning import SkinningDraper
 from recon.files.animations import Moving, write_animated_glb, write_film, write_obj_sequence, write_pc2
 from recon.files.atomic import write_whole
 from recon.files.motions import read_clip
+from recon.files.state import file_digest
 from recon.files.weights import read_manifest
 from recon.metrics import drape_errors
 from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
@@ -38,6 +41,8 @@ SKIN = (0.86, 0.69, 0.58)
 COLOURS = ((0.27, 0.51, 0.76), (0.80, 0.42, 0.36), (0.38, 0.62, 0.43), (0.72, 0.55, 0.80))
 ROUNDS = 40
 """Most rounds of untangling per frame: what has no room in one frame mostly has none in the next."""
+CHUNK = 20
+"""Frames that are untangled between two times that this is kept."""
 LEAD_IN = 24
 """Frames in which a simulated garment goes from the T pose to the motion's first."""
 
@@ -102,22 +107,20 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     if len(config.shape) > body.n_shape:
         raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
     shape[0, : len(config.shape)] = torch.tensor(config.shape)
+    run = _open_run(config, say)
     pose = led_in(motion.body(shape))
     with torch.no_grad():
         posed = body.pose(pose)
     worn: list[Moving] = []
     for k, name in reversed(list(enumerate(config.garments))):
-        at = time.perf_counter()
-        thing, frames = drape(name, config, body, pose, posed, worn)
+        job = lambda _, name=name: drape(name, config, body, pose, posed, worn)  # noqa: E731
+        thing, frames = run.stage(f"drape-{_file_name(name)}", job, config=config.draper)
         worn.insert(0, Moving(thing, frames, COLOURS[k % len(COLOURS)]))
-        say(f"{name:<16} {time.perf_counter() - at:6.1f} s")
     posed = replace(posed, mesh=posed.mesh.with_vertices(posed.mesh.vertices[LEAD_IN:]))
     worn = [replace(part, frames=part.frames[LEAD_IN:]) for part in worn]
     figures: dict = {"garments": {}, "notes": list(motion.notes), "frames": len(motion.pose), "fps": config.fps}
     if config.untangle:
-        at = time.perf_counter()
-        worn, figures["untangle"] = untangled(worn, posed, body, say)
-        say(f"{'untangle':<16} {time.perf_counter() - at:6.1f} s")
+        worn, figures["untangle"] = untangled_in_stages(run, worn, posed, body)
     names = [_file_name(name) for name in config.garments]
     for name, part in zip(names, worn, strict=True):
         figures["garments"][name] = measure(part, posed, body)
@@ -128,6 +131,23 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     figures["seconds"] = round(time.perf_counter() - began, 1)
     write_whole(config.out / "result.json", json.dumps(figures, indent=1) + "\n")
     return Animated(config.out, parts, figures)
+
+
+def _open_run(config: Animate, say: Callable[[str], None]) -> Run:
+    """The animation's folder: its identity is the motion and the garments."""
+
+    def tell(stage: str, event: str, seconds: float) -> None:
+        if event != "start":
+            say(f"{stage:<24} {seconds:6.1f} s{' (kept)' if event == 'kept' else ''}")
+
+    identity = {"motion": file_digest(config.motion), "garments": list(config.garments)}
+    evidence = {
+        "files": [file_digest(g) for g in config.garments if Path(g).is_file()],
+        "weights": read_manifest(config.weights),
+        "shape": list(config.shape),
+        "part": [config.fps, config.start, config.seconds],
+    }
+    return Run(config.out, identity, evidence, say=tell)
 
 
 def _check(config: Animate) -> None:
@@ -141,18 +161,8 @@ def _check(config: Animate) -> None:
         raise UserError(f"garments: found {', '.join(names)}; wanted different names, none of them body")
     if config.fps <= 0:
         raise UserError(f"--fps: found {config.fps}; wanted a positive number")
-    if config.out.exists() and not _is_ours(config.out):
-        raise UserError(f"{config.out}: holds what is no animation's; wanted an empty folder (--out)")
-
-
-def _is_ours(folder: Path) -> bool:
-    """Whether a folder is empty or holds an earlier animation, and not a photo's result."""
-    if not folder.is_dir():
-        return False
-    try:
-        return not any(folder.iterdir()) or "frames" in json.loads((folder / "result.json").read_text())
-    except (OSError, ValueError):
-        return False
+    if not config.motion.is_file():
+        raise UserError(f"{config.motion}: no such file; wanted a motion (npz or bvh)")
 
 
 def _file_name(garment: str) -> str:
@@ -182,10 +192,6 @@ def drape(
     if how == "skinning":
         with torch.no_grad():
             return thing, SkinningDraper(body).drape_vertices(rest, posed)
-    if not isinstance(thing, Garment):
-        raise UserError(
-            f"{name}: a mesh without panels can't be simulated yet; wanted --draper skinning, or train gaps"
-        )
     return thing, simulate(thing, body, posed, under)
 
 
@@ -200,9 +206,10 @@ def led_in(pose: BodyPose) -> BodyPose:
 
 
 @torch.no_grad()
-def simulate(garment: Garment, body: Body, posed: PosedBody, under: Sequence[Moving]) -> Tensor:
+def simulate(garment: Garment | Mesh, body: Body, posed: PosedBody, under: Sequence[Moving]) -> Tensor:
     """(F, V, 3) the garment carried along from the T pose by XPBD, over the layers beneath."""
-    skinned = SkinningDraper(body).drape_vertices(garment.mesh, posed).double().numpy()
+    rest = garment.mesh if isinstance(garment, Garment) else garment
+    skinned = SkinningDraper(body).drape_vertices(rest, posed).double().numpy()
     frames, faces = posed.mesh.vertices.numpy(), body.faces.numpy()
     for layer in under:
         faces = np.concatenate([faces, layer.faces.numpy() + frames.shape[1]])
@@ -212,24 +219,35 @@ def simulate(garment: Garment, body: Body, posed: PosedBody, under: Sequence[Mov
     return torch.as_tensor(np.stack(list(path))).float()
 
 
+def untangled_in_stages(run: Run, worn: Sequence[Moving], posed: PosedBody, body: Body) -> tuple[list[Moving], dict]:
+    """The layers drawn apart in every frame, kept every ``CHUNK`` frames, and how that went."""
+    count, done = len(posed.mesh.vertices), []
+    for first in range(0, count, CHUNK):
+        part = slice(first, min(first + CHUNK, count))
+        job = lambda _, part=part: untangled(worn, posed, body, part)  # noqa: E731
+        done.append(run.stage(f"untangle-{first:05d}", job, config=[ROUNDS, CHUNK]))
+    frames = [torch.cat([chunk[0][k] for chunk in done]) for k in range(len(worn))]
+    how = {key: sum((chunk[1][key] for chunk in done), start=type(done[0][1][key])()) for key in done[0][1]}
+    how["notes"] = how["notes"][:20]
+    return [replace(part, frames=own) for part, own in zip(worn, frames, strict=True)], how
+
+
 def untangled(
-    worn: Sequence[Moving], posed: PosedBody, body: Body, say: Callable[[str], None] | None = None
-) -> tuple[list[Moving], dict]:
-    """The layers drawn apart in every frame, and how that went; ``say`` hears of every tenth."""
+    worn: Sequence[Moving], posed: PosedBody, body: Body, part: slice = slice(None)
+) -> tuple[list[Tensor], dict]:
+    """(F, V, 3) frames of each layer, drawn apart, of that part of the motion, and how that went."""
     frames: list[list[Tensor]] = [[] for _ in worn]
-    clean, crossings, notes = 0, 0, []
-    for k in range(len(posed.mesh.vertices)):
-        layers = [Mesh(part.frames[k], part.faces) for part in worn]
+    clean, crossings, notes = 0, 0, list[str]()
+    for k in range(len(posed.mesh.vertices))[part]:
+        layers = [Mesh(own.frames[k], own.faces) for own in worn]
         done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces), Untangling(rounds=ROUNDS))
-        if say and k % 10 == 9:
-            say(f"untangle: frame {k + 1} of {len(posed.mesh.vertices)}")
         clean += done.clean
         crossings += done.crossings
         notes += [f"frame {k}: {note}" for note in done.notes]
         for own, x in zip(frames, done.vertices, strict=True):
             own.append(torch.as_tensor(x).float())
-    parts = [replace(part, frames=torch.stack(own)) for part, own in zip(worn, frames, strict=True)]
-    return parts, {"clean_frames": clean, "crossing_pairs_before": crossings, "notes": notes[:20]}
+    how = {"clean_frames": clean, "crossing_pairs_before": crossings, "notes": notes}
+    return [torch.stack(own) for own in frames], how
 
 
 def measure(part: Moving, posed: PosedBody, body: Body) -> dict[str, float]:

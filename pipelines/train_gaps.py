@@ -212,7 +212,7 @@ class Loss:
         off = moved[..., self.template.held, :].square().sum((1, 2, 3))
         loss = (energy.unflatten(0, (c.windows, c.frames)).sum(1) + swung + c.pin * off).mean() / c.frames
         shown = {name: float(v.mean()) for name, v in terms.items() if name != "gravity"}
-        return loss, {"loss": loss.item(), **shown, "inertia": float(swung.mean()) / c.frames}
+        return loss, {"loss": loss.item(), **shown, "inertia": float(swung.detach().mean()) / c.frames}
 
 
 def _settings(config: TrainGaps) -> str:

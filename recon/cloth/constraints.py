@@ -34,12 +34,17 @@ class Constraints:
     @classmethod
     def from_garment(cls, garment: Garment, cloth: Cloth, held: NDArray | None = None) -> Constraints:
         """Edges and bends of a garment's cloth; ``held`` (H,) vertices of its waistband."""
+        return cls.from_cloth(cloth, _panel_positions(garment), held)
+
+    @classmethod
+    def from_cloth(cls, cloth: Cloth, rest: NDArray, held: NDArray | None = None) -> Constraints:
+        """Edges and bends of any cloth; ``rest`` (V, 3) a shape in which neighbours are close."""
         return cls(
             edges=cloth.edges.numpy(),
             edge_lengths=cloth.edge_lengths.double().numpy(),
             bends=cloth.hinges[:, 2:].numpy(),
             bend_lengths=_flat_spans(cloth),
-            rest=_panel_positions(garment),
+            rest=rest,
             held=np.zeros(0, np.int64) if held is None else held,
         )
 

@@ -61,8 +61,11 @@ def border_numbers(rim: NDArray, vertices: int) -> NDArray:
     return loops
 
 
-def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_]) -> NDArray:
-    """``x`` (V, 3) with the ``free`` vertices each in the middle of its neighbours, the others held."""
+def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_], gap: float = 0.0) -> NDArray:
+    """``x`` (V, 3) with the ``free`` vertices each in the middle of its neighbours, the others held.
+
+    What lay further off than ``gap`` goes on by as much [m]: two pockets that poked into each other end apart.
+    """
     touched = edges[free[edges].any(1)]
     if not len(touched):
         return x
@@ -75,5 +78,7 @@ def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_]) -> NDArray:
     held = 1e-9 * x[free]
     np.add.at(held, number[a[~inside]], x[b[~inside]])
     out = x.copy()
-    out[free] = splu(sp.csc_matrix(matrix)).solve(held)
+    flat = splu(sp.csc_matrix(matrix)).solve(held)
+    move = flat - x[free]
+    out[free] = flat + gap * move / np.maximum(np.linalg.norm(move, axis=1, keepdims=True), max(gap, 1e-12))
     return out

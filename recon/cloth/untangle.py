@@ -169,7 +169,7 @@ class _Tangle:
         crossing = np.zeros(len(self.edges), bool)
         crossing[found[:, 0]] = True
         free = self.pockets.find(crossing)
-        self.x = laid_across(self.x, self.edges, free)
+        self.x = laid_across(self.x, self.edges, free, self.settings.gap)
         mine = free[self.edges].any(1)
         ends = self.x[self.edges[mine]]
         self.lengths[mine] = np.minimum(self.lengths[mine], np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))

@@ -20,7 +20,7 @@ from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping import Draper
 from recon.garments import WAISTED
 from recon.garments.panels import waistband
-from recon.types import BodyPose, Garment, to_device
+from recon.types import BodyPose, Garment, Mesh, to_device
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,16 @@ class Dressing:
     """Coulomb friction: little, so that cloth slips to where it is at ease, as it does while people dress."""
 
 
-def limits_of(garment: Garment) -> Constraints:
+def limits_of(garment: Garment | Mesh) -> Constraints:
     """What the simulator needs to know of a garment: its cloth, its waistband, and which parts are strangers.
 
-    Strangers are told by the shape at rest on the body, where both sides of a seam are neighbours.
+    Strangers are told by the shape at rest on the body, where both sides of a seam are neighbours. A mesh without
+    panels is its own pattern, and nothing holds it.
     """
+    if isinstance(garment, Mesh):
+        return Constraints.from_cloth(Cloth.from_mesh(garment), garment.vertices.detach().double().numpy())
     held = waistband(garment) if garment.kind in WAISTED else None
-    limits = Constraints.from_garment(garment, Cloth.from_garment(garment), held)
-    return replace(limits, rest=garment.mesh.vertices.detach().double().numpy())
+    return Constraints.from_cloth(Cloth.from_garment(garment), garment.mesh.vertices.detach().double().numpy(), held)
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ from recon.bodies import load_body
 from recon.bodies.rig import axis_angles, rotation_matrices
 from recon.draping.gaps import FEATURES, Bound, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
 from recon.files.animations import read_pc2
+from recon.files.meshes import write_obj
 from recon.garments.dataset import load_garments
 from recon.types import BodyPose, Mesh, UserError
 
@@ -165,12 +166,26 @@ def test_animate_writes_what_it_was_asked_for(trained, motions, tmp_path) -> Non
     )  # fmt: skip
     done = animate(config, say=lambda line: None)
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
-        "scene.glb", "film.gif", "mini.pc2", "body.pc2", "mini", "body", "result.json",
+        "scene.glb", "film.gif", "mini.pc2", "body.pc2", "mini", "body", "result.json", "run.json", "stages",
     }  # fmt: skip
     figures = done.figures["garments"]["mini"]
     assert done.figures["frames"] == 6 and done.figures["untangle"]["clean_frames"] == 6
     assert figures["eps_c"] == 0 and figures["eps_e"] < 15
     torch.testing.assert_close(read_pc2(tmp_path / "out" / "mini.pc2"), done.parts["mini"].frames)
+    heard: list[str] = []
+    again = animate(config, say=heard.append)
+    assert all(line.endswith("(kept)") for line in heard) and len(heard) == 2
+    assert torch.equal(again.parts["mini"].frames, done.parts["mini"].frames)
+
+
+def test_a_mesh_without_panels_is_simulated(garment, motions, tmp_path) -> None:
+    write_obj(garment.mesh, tmp_path / "cloth.obj")
+    config = Animate(
+        (str(tmp_path / "cloth.obj"),), motions / "stroll.npz", tmp_path / "out", seconds=0.1, untangle=False,
+        formats=("obj",),
+    )  # fmt: skip
+    found = animate(config, say=lambda line: None).figures["garments"]["cloth"]
+    assert found["eps_c"] < 1 and found["eps_e"] < 6
 
 
 def test_layers_are_simulated_over_each_other(motions, tmp_path) -> None:
@@ -204,10 +219,10 @@ def test_mistakes_are_one_line(change: dict, says: str, trained, motions, tmp_pa
 
 def test_a_folder_of_something_else_is_left_alone(trained, motions, tmp_path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(UserError, match="no animation"):
+    with pytest.raises(UserError, match="no run wrote"):
         animate(Animate(("mini",), motions / "march.npz", tmp_path, weights=trained[0]), say=lambda line: None)
     assert (tmp_path / "thesis.txt").read_text() == "mine"
     (tmp_path / "result.json").write_text('{"schema": 1, "garments": {}}')  # a photo's
-    with pytest.raises(UserError, match="no animation"):
+    with pytest.raises(UserError, match="no run wrote"):
         animate(Animate(("mini",), motions / "march.npz", tmp_path, weights=trained[0]), say=lambda line: None)
     assert "schema" in (tmp_path / "result.json").read_text()
