@@ -113,6 +113,7 @@ COMMANDS = {
     ),
     "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", _show_figures, "what"),
     "drape": Command("dress a body in garments", "pipelines.drape", "Drape", "drape", _show_drape, "garments"),
+    "edit": Command("change a garment through its pattern", "pipelines.edit", "Edit", "edit", _show_figures, "what"),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -18,11 +19,14 @@ from pipelines.fit_code import CodeFit, find_code
 from pipelines.garment_source import latent_of
 from recon.files.codes import write_code
 from recon.files.meshes import write_mesh
+from recon.files.patterns import write_svg
 from recon.garments import GarmentDecoder, load_decoder
 from recon.metrics import boundary_loops
 from recon.types import Garment, UserError
 
 FORMATS = (".obj", ".ply", ".glb")
+PATTERN_RESOLUTION = 128
+"""Most cells of the grid that patterns for editing are cut on."""
 RESOLUTIONS = (16, 1024)
 """Least and most cells along the domain's side."""
 
@@ -44,6 +48,8 @@ class Decode:
     """Folder of your own weights; None = those that ship."""
     code: Path | None = None
     """Also write the code to this .json file, which commands take as CODE."""
+    pattern: Path | None = None
+    """Also write the panels to this .svg file, at true scale; ``recon edit`` reads it back."""
     fit: Path | None = None
     """Evidence to find the code from: a mesh (obj, ply, stl, off, glb) or points (ply, npy, xyz, txt), at rest on the
     neutral body in metres; or the garment's silhouette (png, jpg) as the neutral body wears it, seen by the camera of
@@ -68,7 +74,7 @@ def decode(config: Decode, tick: Callable[[int, float], None] | None = None) -> 
         raise UserError(f"{config.out}: is the evidence; wanted another file to write")
     decoder = load_decoder(config.what[0], config.decoder, folder=config.weights)
     if config.fit is None:
-        return finish(decoder, latent_of(decoder, config.what[1]), config.resolution, config.out, config.code)
+        return finish(decoder, latent_of(decoder, config.what[1]), config)
     return _fitted(config, decoder, config.fit, tick)
 
 
@@ -80,12 +86,13 @@ def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[
         raise UserError(f"decoder: found {config.decoder}; --fit wanted isp")
     evidence = evidence_of(decoder, fit, config.search.seed)
     begun = time.perf_counter()
-    found = find_code(decoder, evidence, evidence.starts(Bank.of(decoder)), config.search, tick)
+    starts = evidence.starts(Bank.of(decoder))
+    found = find_code(decoder, evidence, decoder.codes[starts], config.search, tick)
     spent = time.perf_counter() - begun
-    said = finish(decoder, found.latent, config.resolution, config.out, config.code)
+    said = finish(decoder, found.latent, config)
     evidence.renew(found.latent)
     figures = {k: round(v, 3) for k, v in evidence.figures(found.latent).items()}
-    return {**said, **figures, "search_s": round(spent, 1), "starts": list(found.starts)}
+    return {**said, **figures, "search_s": round(spent, 1), "start": starts[found.start]}
 
 
 def check(out: Path, resolution: int) -> None:
@@ -97,16 +104,33 @@ def check(out: Path, resolution: int) -> None:
         raise UserError(f"resolution: found {resolution}; wanted {low} to {high}")
 
 
-def finish(decoder: GarmentDecoder, latent: Tensor, resolution: int, out: Path, code: Path | None) -> dict:
-    """Decode one code (z,), write the garment and perhaps the code; the figures."""
+@runtime_checkable
+class Outputs(Protocol):
+    """Settings that say what to write."""
+
+    @property
+    def out(self) -> Path: ...
+    @property
+    def resolution(self) -> int: ...
+    @property
+    def code(self) -> Path | None: ...
+    @property
+    def pattern(self) -> Path | None: ...
+
+
+def finish(decoder: GarmentDecoder, latent: Tensor, wanted: Outputs) -> dict:
+    """Decode one code (z,), write the garment and perhaps the code and the pattern; the figures."""
     begun = time.perf_counter()
     with torch.no_grad():
-        garment = decoder.decode(latent, resolution)
+        garment = decoder.decode(latent, wanted.resolution)
     spent = time.perf_counter() - begun
-    write_mesh(garment, out)
-    if code is not None:
-        write_code(code, decoder.kind, latent)
-    return {"file": str(out), **summary(garment), "decode_ms": round(1e3 * spent)}
+    write_mesh(garment, wanted.out)
+    if wanted.code is not None:
+        write_code(wanted.code, decoder.kind, latent)
+    if wanted.pattern is not None:
+        with torch.no_grad():  # coarse outlines are what people can edit
+            write_svg(decoder.decode(latent, min(wanted.resolution, PATTERN_RESOLUTION)), wanted.pattern)
+    return {"file": str(wanted.out), **summary(garment), "decode_ms": round(1e3 * spent)}
 
 
 def summary(garment: Garment) -> dict:

@@ -94,10 +94,10 @@ def seam_gap(decoder: IspDecoder, garment: Garment) -> Tensor:
 def fit_pattern(decoder: IspDecoder, truth: Garment, seed: int = 0) -> Tensor:
     """The code (z,) whose flat panels match the garment's."""
     evidence = PatternEvidence.of(decoder, truth, seed)
-    return find_code(decoder, evidence, evidence.starts(), CodeFit(seed=seed)).latent
+    return find_code(decoder, evidence, decoder.codes[evidence.starts()], CodeFit(seed=seed)).latent
 
 
 def fit_surface(decoder: IspDecoder, target: Mesh | Tensor, bank: Bank, seed: int = 0) -> Tensor:
     """The code (z,) whose sewn garment is nearest to a mesh or to points (N, 3); nothing of the pattern is used."""
     evidence = SurfaceEvidence(decoder, target, seed=seed)
-    return find_code(decoder, evidence, evidence.starts(bank), CodeFit(seed=seed)).latent
+    return find_code(decoder, evidence, decoder.codes[evidence.starts(bank)], CodeFit(seed=seed)).latent

@@ -113,38 +113,39 @@ class FoundCode:
     """(z,)."""
     energy: float
     """At the end, all terms."""
-    starts: tuple[int, ...]
-    """Learned codes that it began from."""
+    start: int
+    """Row of the starts that led there."""
 
 
 def find_code(
     decoder: IspDecoder,
     evidence: Evidence,
-    starts: list[int],
+    starts: Tensor,
     settings: CodeFit,
     tick: Callable[[int, float], None] | None = None,
 ) -> FoundCode:
-    """The code of least energy that is found from the learned codes ``starts``.
+    """The code of least energy that is found from the codes ``starts`` (K, z).
 
     Raises:
         UserError: no start leads to a garment.
     """
-    scores = [_score(decoder, evidence, decoder.codes[k], settings) for k in starts]
-    order = [starts[k] for k in np.argsort(scores)[: settings.starts].tolist()]
-    tries = [_round(decoder, evidence, decoder.codes[k], settings) for k in order]
-    latent, energy = min(tries, key=lambda end: end[1])
-    for number in range(1, settings.rounds):  # only the most promising goes on
+    scores = [_score(evidence, latent) for latent in starts]
+    order = np.argsort(scores)[: settings.starts].tolist()
+    tries = [_round(decoder, evidence, starts[k], settings) for k in order]
+    number = min(range(len(tries)), key=lambda k: tries[k][1])
+    latent, energy = tries[number]
+    for step in range(1, settings.rounds):  # only the most promising goes on
         if tick:
-            tick(number, energy)
+            tick(step, energy)
         found, after = _round(decoder, evidence, latent, settings)
         if after < HOPELESS:
             latent, energy = found, after
     if energy >= HOPELESS:
-        raise UserError(f"{decoder.kind}: no learned code leads to the evidence; is it a garment of another kind?")
-    return FoundCode(latent, energy, tuple(order))
+        raise UserError(f"{decoder.kind}: no start leads to the evidence; is it a garment of another kind?")
+    return FoundCode(latent, energy, order[number])
 
 
-def _score(decoder: IspDecoder, evidence: Evidence, latent: Tensor, settings: CodeFit) -> float:
+def _score(evidence: Evidence, latent: Tensor) -> float:
     try:
         with torch.no_grad():
             evidence.renew(latent)

@@ -52,7 +52,9 @@ class PatternEvidence:
         self.decoder = decoder
         self.at = torch.as_tensor(at, dtype=torch.float32)
         self.distance = torch.as_tensor(np.stack([d for d, _ in measured], 1), dtype=torch.float32)
-        self.label = torch.as_tensor(np.stack([c for _, c in measured], 1))
+        labels = torch.as_tensor(np.stack([c for _, c in measured], 1))
+        self.label = labels if all(isinstance(b, Border) for b in panels) else None
+        """Which seam each border is; None = not known (drawn outlines)."""
 
     @staticmethod
     def of(decoder: IspDecoder, truth: Garment, seed: int = 0) -> PatternEvidence:
@@ -68,8 +70,9 @@ class PatternEvidence:
         found, logits = nets.split_pattern(nets.pattern.run_folded(nets.pattern.fold(latent), self.at))
         error = ((found - self.distance).square() + 1e-6).sqrt() - 1e-3
         error = error * (0.1 / self.distance.abs().clamp_min(0.1))  # far away only the side matters
-        entropy = F.cross_entropy(logits.flatten(0, 1), self.label.flatten())
-        return SCALE * error.mean() + 0.02 * entropy
+        if self.label is None:
+            return SCALE * error.mean()
+        return SCALE * error.mean() + 0.02 * F.cross_entropy(logits.flatten(0, 1), self.label.flatten())
 
     def starts(self) -> list[int]:
         """Learned codes whose panels are closest, best first."""

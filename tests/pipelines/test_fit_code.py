@@ -48,7 +48,7 @@ def pair(decoder):
 def test_a_pattern_leads_to_its_code(decoder, pair):
     truth, start = pair
     evidence = PatternEvidence.of(decoder, truth)
-    found = find_code(decoder, evidence, [start], CodeFit(starts=1, rounds=2, steps=10))
+    found = find_code(decoder, evidence, decoder.codes[[start]], CodeFit(starts=1, rounds=2, steps=10))
     with torch.no_grad():
         before, after = (panel_iou(decoder.decode(z, 48), truth) for z in (decoder.codes[start], found.latent))
     assert 1 - after < 0.6 * (1 - before)
@@ -60,7 +60,7 @@ def test_a_surface_leads_closer(decoder, pair, sparse):
     truth, start = pair
     points = sample_surface(truth.mesh, 200, torch.Generator().manual_seed(1))[0]
     evidence = SurfaceEvidence(decoder, points if sparse else truth.mesh, 40, 500)
-    found = find_code(decoder, evidence, [start], SHORT)
+    found = find_code(decoder, evidence, decoder.codes[[start]], SHORT)
 
     def off(z):
         with torch.no_grad():
@@ -94,7 +94,7 @@ def test_a_silhouette_leads_closer(decoder, pair):
     drawn.take(truth)
     evidence = SilhouetteEvidence(decoder, drawn.image(truth.mesh.vertices), camera, 96, 40)
     before = evidence.figures(decoder.codes[start])["iou"]
-    found = find_code(decoder, evidence, [start], SHORT)
+    found = find_code(decoder, evidence, decoder.codes[[start]], SHORT)
     assert 1 - evidence.figures(found.latent)["iou"] < 0.8 * (1 - before)
 
 
