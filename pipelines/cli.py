@@ -124,6 +124,9 @@ COMMANDS = {
     "train layers-isp": Command(
         "learn to layer garments", "pipelines.train_layers_isp", "TrainLayersIsp", "train_layers_isp"
     ),
+    "train drape-drapenet": Command(
+        "learn to drape any garment: DrapeNet's networks", "pipelines.train_drapenet", "TrainDrapenet", "train_drapenet"
+    ),
     "doctor": Command("say whether everything is in place", "pipelines.doctor", "", "main"),
 }
 

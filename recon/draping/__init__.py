@@ -22,6 +22,7 @@ class Draper(Protocol):
 DRAPERS = {
     "skinning": "recon.draping.skinning:load_skinning",
     "isp": "recon.draping.isp:load_isp_draper",
+    "drapenet": "recon.draping.drapenet:load_drapenet",
 }
 """Draper name -> ``module:function`` of (body, folder)."""
 

@@ -1,0 +1,275 @@
+"""DrapeNet: one network drapes any garment, vertex by vertex (De Luigi et al. 2023, §3.2).
+
+D(x, beta, theta, z) = W(x + dx(x, beta) + dx_ref(x, beta, theta, z), beta, theta, W(x))        (Eq. 6)
+dx_ref = B(beta, theta) M(x, z)
+
+The skinning field W and the shape field dx are learned from the body alone; B and M from physics, one pair for garments
+that hang from the shoulders and one for those that hang from the waist. The intersection solver (Eq. 9) adds a
+displacement of the lower garment that knows both codes. A code z describes a mesh by its unsigned distances from fixed
+points (:class:`RestCode`), so that any mesh at rest on the neutral body can be draped, whichever decoder it came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from recon.bodies.rig import JOINT_NAMES
+from recon.bodies.skin import skin
+from recon.cloth.contact import BodyContact
+from recon.draping.isp import pose_features
+from recon.files.weights import read_weights
+from recon.types import Garment, Mesh, PosedBody, UserError
+
+GROUPS: dict[str, tuple[str, ...]] = {"top": ("top", "dress"), "bottom": ("trousers", "skirt")}
+"""Network -> the kinds of garments that it drapes."""
+JOINTS = 24
+CHEST = JOINT_NAMES.index("spine3")
+FARTHEST = 0.15
+"""Distances from the fixed points count up to this [m]."""
+POSE_FEATURES = 23 * 6 + 3
+
+
+def waves(x: Tensor, octaves: int) -> Tensor:
+    """(N, 3) points [m] -> (N, 3 + 6 octaves): themselves and sines and cosines of half a turn a metre and up."""
+    scale = torch.pi * 2.0 ** torch.arange(octaves, dtype=x.dtype, device=x.device)
+    angle = (x[:, None] * scale[:, None]).flatten(1)
+    return torch.cat([x, angle.sin(), angle.cos()], 1)
+
+
+def mlp(inputs: int, width: int, depth: int, outputs: int, last: float = 1.0) -> nn.Sequential:
+    """``depth`` SiLU layers and a linear one, whose weights start ``last`` times as large as usual."""
+    layers: list[nn.Module] = []
+    for k in range(depth):
+        layers += [nn.Linear(inputs if k == 0 else width, width), nn.SiLU()]
+    out = nn.Linear(width, outputs)
+    with torch.no_grad():
+        out.weight.mul_(last)
+        out.bias.zero_()
+    return nn.Sequential(*layers, out)
+
+
+class BodyFieldNet(nn.Module):
+    """W(x) and dx(x, beta): the body's skinning weights and shape directions carried into the space around it."""
+
+    def __init__(self, n_shape: int, width: int = 160, depth: int = 4, octaves: int = 4):
+        super().__init__()
+        self.shape = {"n_shape": n_shape, "width": width, "depth": depth, "octaves": octaves}
+        self.octaves = octaves
+        self.net = mlp(3 + 6 * octaves, width, depth, JOINTS + 3 * n_shape)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) points in the neutral body's T-pose space -> weights (N, 24), sum 1; directions (N, 3, S) [m]."""
+        out = self.net(waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.octaves))
+        return out[:, :JOINTS].softmax(1), 0.01 * out[:, JOINTS:].unflatten(1, (3, -1))
+
+
+@dataclass(frozen=True)
+class DrapeShape:
+    """What is needed to rebuild a draping network."""
+
+    n_shape: int
+    code: int = 32
+    """Size of the garments' codes; a solver's is that of both codes."""
+    terms: int = 48
+    """N_B of §3.2.1."""
+    width: int = 160
+    depth: int = 4
+    octaves: int = 5
+    scale: float = 0.03
+    """Displacement [m] that an output of one means."""
+
+
+class Displacements(nn.Module):
+    """dx_ref = B(beta, theta) M(x, z)."""
+
+    def __init__(self, shape: DrapeShape):
+        super().__init__()
+        self.shape = shape
+        self.embed = mlp(POSE_FEATURES + shape.n_shape, shape.width, 2, shape.terms)
+        inputs = 3 + 6 * shape.octaves + shape.code
+        self.maps = mlp(inputs, shape.width, shape.depth, 3 * shape.terms, last=0.1)
+
+    def matrix(self, x: Tensor, code: Tensor) -> Tensor:
+        """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]."""
+        seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
+        out = self.maps(torch.cat([seen, code.expand(len(x), -1)], 1))
+        return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1)
+
+    def embedding(self, body: PosedBody) -> Tensor:
+        """B: (B, N_B) of posed bodies."""
+        return self.embed(torch.cat([pose_features(body.transforms, range(1, JOINTS)), body.shape], 1))
+
+    def forward(self, matrix: Tensor, body: PosedBody) -> Tensor:
+        """(N_B, N, 3) of :meth:`matrix` -> displacements (B, N, 3) [m]."""
+        return torch.einsum("bk,knd->bnd", self.embedding(body), matrix)
+
+
+class RestCode(nn.Module):
+    """z: unsigned distances of a garment at rest from fixed points, in the learned garments' principal components."""
+
+    points: Tensor
+    mean: Tensor
+    components: Tensor
+
+    def __init__(self, points: int = 256, size: int = 32):
+        super().__init__()
+        self.register_buffer("points", torch.zeros(points, 3))
+        self.register_buffer("mean", torch.zeros(points))
+        self.register_buffer("components", torch.zeros(size, points))
+
+    def distances(self, mesh: Mesh) -> Tensor:
+        """(P,) how far each fixed point is from the surface, up to ``FARTHEST`` [m]; no gradient."""
+        x = mesh.vertices.detach()
+        with torch.no_grad():
+            return BodyContact(x, mesh.faces).signed_distance(self.points).abs().clamp(max=FARTHEST)
+
+    def know(self, meshes: Sequence[Mesh], generator: torch.Generator) -> None:
+        """Choose points on the meshes and a little off them, and the components of their distances."""
+        everything = torch.cat([m.vertices.detach() for m in meshes])
+        chosen = torch.randperm(len(everything), generator=generator)[: len(self.points)]
+        noise = 0.03 * torch.randn(len(self.points), 3, generator=generator)
+        self.points.copy_(everything[chosen] + noise)
+        rows = torch.stack([self.distances(m) for m in meshes])
+        self.mean.copy_(rows.mean(0))
+        _, spread, axes = torch.linalg.svd(rows - self.mean, full_matrices=False)
+        size = min(len(self.components), len(axes))
+        deviation = spread[:size].clamp_min(1e-6) / len(rows) ** 0.5
+        self.components.zero_()
+        self.components[:size] = axes[:size] / deviation.clamp_min(0.05 * deviation[0])[:, None]
+
+    def forward(self, mesh: Mesh) -> Tensor:
+        """(z,) the code of a mesh at rest on the neutral body, about one in each component; clamped to three."""
+        return (self.components @ (self.distances(mesh) - self.mean)).clamp(-3, 3)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """All that is known of a garment before the body moves."""
+
+    rest: Tensor
+    """(N, 3) [m]."""
+    weights: Tensor
+    """(N, 24)."""
+    directions: Tensor
+    """(N, 3, S) [m]."""
+    matrix: Tensor
+    """(N_B, N, 3) [m]."""
+    code: Tensor
+    """(z,)."""
+    solved: Tensor | None = None
+    """(N_B, N, 3) the intersection solver's matrix, under a given garment above."""
+
+    def moved(self, nets: DrapeNets, group: str, body: PosedBody) -> Tensor:
+        """(B, N, 3) what is added to the shaped garment before it is skinned [m]."""
+        out = nets.displacements(group)(self.matrix, body)
+        return out if self.solved is None else out + nets.solver(self.solved, body)
+
+    def place(self, moved: Tensor, body: PosedBody) -> Tensor:
+        """(B, N, 3) displacements -> vertices in the world (Eq. 6)."""
+        shaped = self.rest + torch.einsum("nds,bs->bnd", self.directions, body.shape)
+        return skin(shaped + moved, body.transforms, self.weights)
+
+
+class DrapeNets(nn.Module):
+    """All networks: the body's field, codes, one draping network a group, and the solver."""
+
+    def __init__(self, shape: DrapeShape):
+        super().__init__()
+        self.field = BodyFieldNet(shape.n_shape)
+        self.code = RestCode(size=shape.code)
+        self.drape = nn.ModuleDict({group: Displacements(shape) for group in GROUPS})
+        solver = DrapeShape(shape.n_shape, 2 * shape.code, 24, 96, 3, shape.octaves, shape.scale)
+        self.solver = Displacements(solver)
+
+    def displacements(self, group: str) -> Displacements:
+        """The network of a group."""
+        net = self.drape[group]
+        assert isinstance(net, Displacements)
+        return net
+
+    def prepare(self, mesh: Mesh, group: str, above: Tensor | None = None) -> Prepared:
+        """A mesh at rest on the neutral body, made ready; ``above`` (z,): code of the garment over it, for the solver.
+
+        Differentiable in the mesh's vertices, the code held.
+        """
+        x = mesh.vertices
+        code = self.code(mesh)
+        weights, directions = self.field(x)
+        matrix = self.displacements(group).matrix(x, code)
+        solved = None if above is None else self.solver.matrix(x, torch.cat([above, code]))
+        return Prepared(x, weights, directions, matrix, code, solved)
+
+
+def group_of(kind: str) -> str:
+    """The network that drapes a kind of garment (``GROUPS``); UserError: none does."""
+    for group, kinds in GROUPS.items():
+        if kind in kinds:
+            return group
+    raise UserError(f"drapenet: no network drapes a {kind}; wanted {', '.join(k for v in GROUPS.values() for k in v)}")
+
+
+class DrapeNetDraper:
+    """A ``Draper``: any garment of the groups, decoded or a user's mesh."""
+
+    def __init__(self, nets: DrapeNets, chest: float):
+        """``chest``: height of the neutral body's chest [m]: meshes of no known kind that end above it are tops."""
+        self.nets = nets.eval().requires_grad_(False)
+        self.chest = chest
+        self._last: tuple[Tensor, str, Prepared] | None = None
+
+    def group(self, garment: Garment) -> str:
+        """The network that drapes a garment: by its kind, or for a bare mesh by how high it reaches."""
+        if garment.kind:
+            return group_of(garment.kind)
+        return "top" if float(garment.mesh.vertices.detach()[:, 1].max()) > self.chest else "bottom"
+
+    def prepared(self, garment: Garment) -> Prepared:
+        """The garment made ready; the last one is remembered where no gradient is asked for."""
+        rest, group = garment.mesh, self.group(garment)
+        if rest.vertices.requires_grad and torch.is_grad_enabled():
+            return self.nets.prepare(rest, group)
+        if self._last is None or self._last[0] is not rest.vertices or self._last[1] != group:
+            self._last = rest.vertices, group, self.nets.prepare(rest, group)
+        return self._last[2]
+
+    def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
+        """The garment on B bodies: Mesh with (B, N, 3) vertices; the layers beneath play no part (see ``outfit``)."""
+        ready = self.prepared(garment)
+        moved = ready.moved(self.nets, self.group(garment), body)
+        return Mesh(ready.place(moved, body), garment.mesh.faces)
+
+    def outfit(self, top: Garment, bottom: Garment, body: PosedBody) -> tuple[Mesh, Mesh]:
+        """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9)."""
+        group, above = self.group(bottom), self.prepared(top).code
+        ready = self.nets.prepare(bottom.mesh, group, above)
+        lower = ready.place(ready.moved(self.nets, group, body), body)
+        return self.drape(top, body), Mesh(lower, bottom.mesh.faces)
+
+
+def load_drapenet(body, folder: str | Path | None = None) -> DrapeNetDraper:
+    """The trained draper, from ``folder`` or else the packaged weights.
+
+    Raises:
+        UserError: weights missing or corrupt, or learned for a body with other shape coefficients.
+    """
+    weights = read_weights("drapenet", folder)
+    try:
+        nets = DrapeNets(DrapeShape(**weights.card["shape"]))
+        nets.load_state_dict({k: v.float() for k, v in weights.tensors.items()})
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise UserError(f"drapenet: weights and card don't describe draping networks ({error})") from error
+    if body.n_shape != weights.card["shape"]["n_shape"] or body.name != weights.card["body"]:
+        raise UserError(f"drapenet: learned for the body {weights.card['body']}; found {body.name}")
+    chest = float(body.rest_joints(body.neutral().shape)[0, CHEST, 1])
+    return DrapeNetDraper(nets.to(body.weights.device), chest)
+
+
+def under_top(bottom: Tensor, top: Tensor, gamma: float) -> Tensor:
+    """Eq. 11 per body: distances (B, C) of covered body points to bottom and top garments [m] -> (B,)."""
+    return F.relu(bottom - gamma * top).sum(1)

@@ -1,0 +1,176 @@
+"""DrapeNet's networks: Eq. 6 piece by piece, codes of any mesh, the solver, and what the draper does with them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import pytest
+import torch
+
+from recon.bodies import load_body
+from recon.draping.drapenet import (
+    DrapeNetDraper,
+    DrapeNets,
+    DrapeShape,
+    RestCode,
+    group_of,
+    load_drapenet,
+    under_top,
+    waves,
+)
+from recon.files.weights import write_weights
+from recon.garments.dataset import load_garments
+from recon.types import BodyPose, Mesh, UserError
+
+BODY = load_body()
+TOPS, TROUSERS = load_garments("top", "test"), load_garments("trousers", "test")
+
+
+@pytest.fixture(scope="module")
+def nets() -> DrapeNets:
+    torch.manual_seed(0)
+    nets = DrapeNets(DrapeShape(BODY.n_shape, code=6, width=24, depth=2, terms=5))
+    nets.code.know([g.mesh for g in (*TOPS[:8], *TROUSERS[:4])], torch.Generator().manual_seed(0))
+    return nets
+
+
+def posed(batch: int = 2):
+    generator = torch.Generator().manual_seed(1)
+    pose = 0.2 * torch.randn(batch, 24, 3, generator=generator)
+    shape = 0.5 * torch.randn(batch, BODY.n_shape, generator=generator)
+    return BODY.pose(BodyPose(shape, pose, torch.randn(batch, 3, generator=generator)))
+
+
+def test_shapes_and_any_mesh(nets):
+    draper, body = DrapeNetDraper(nets, 1.2), posed()
+    for garment in (TOPS[0], TROUSERS[0]):
+        out = draper.drape(garment, body)
+        assert out.vertices.shape == (2, len(garment.mesh.vertices), 3) and out.vertices.isfinite().all()
+        assert out.faces is garment.mesh.faces
+
+
+def test_weights_sum_to_one_and_field_is_of_points_alone(nets):
+    x = TOPS[0].mesh.vertices
+    weights, directions = nets.field(x)
+    assert torch.allclose(weights.sum(1), torch.ones(len(x)), atol=1e-5) and (weights >= 0).all()
+    some, other = nets.field(x[5:9])
+    assert torch.allclose(some, weights[5:9], atol=1e-5) and torch.allclose(other, directions[5:9], atol=1e-6)
+
+
+def test_displacement_is_linear_in_the_embedding(nets):
+    """dx_ref = B M: the sum over the terms, vertex by vertex."""
+    body, net = posed(), nets.drape["top"]
+    ready = nets.prepare(TOPS[0].mesh, "top")
+    moved, embedding = net(ready.matrix, body), net.embedding(body)
+    by_hand = sum(embedding[:, k, None, None] * ready.matrix[k] for k in range(5))
+    assert torch.allclose(moved, by_hand, atol=1e-6)
+    halves = [nets.prepare(Mesh(TOPS[0].mesh.vertices, f), "top") for f in TOPS[0].mesh.faces.split(1000)]
+    assert halves[0].matrix.shape == ready.matrix.shape
+
+
+def test_where_and_whither_a_person_stands_and_turns_about_up_does_not_matter(nets):
+    pose = 0.2 * torch.randn(1, 24, 3, generator=torch.Generator().manual_seed(2))
+    pose[:, 0] = 0
+    turned = pose.clone()
+    turned[:, 0, 1] = 1.3
+    shape = torch.zeros(1, BODY.n_shape)
+    one = BODY.pose(BodyPose(shape, pose, torch.zeros(1, 3)))
+    other = BODY.pose(BodyPose(shape, turned, torch.ones(1, 3)))
+    net = nets.displacements("top")
+    assert torch.allclose(net.embedding(one), net.embedding(other), atol=1e-5)
+
+
+def test_codes_tell_garments_apart_and_know_meshes_by_their_surface(nets):
+    codes = torch.stack([nets.code(g.mesh) for g in TOPS])
+    assert codes.isfinite().all() and codes.abs().max() <= 3
+    assert torch.cdist(codes, codes).fill_diagonal_(1).min() > 1e-2
+    mesh = TOPS[0].mesh
+    middle = mesh.vertices[mesh.faces].mean(1)
+    n = len(mesh.vertices) + torch.arange(len(mesh.faces))
+    finer = torch.cat([torch.stack([mesh.faces[:, k], mesh.faces[:, (k + 1) % 3], n], 1) for k in range(3)])
+    assert torch.allclose(nets.code(Mesh(torch.cat([mesh.vertices, middle]), finer)), codes[0], atol=1e-3)
+
+
+def test_codes_of_few_garments():
+    code = RestCode(points=16, size=8)
+    code.know([g.mesh for g in TOPS[:3]], torch.Generator().manual_seed(0))
+    assert code(TOPS[0].mesh).shape == (8,) and code.components[3:].abs().max() == 0
+
+
+def test_the_solver_moves_the_bottom_alone_and_knows_both_codes(nets):
+    draper, body = DrapeNetDraper(nets, 1.2), posed()
+    upper, lower = draper.outfit(TOPS[0], TROUSERS[0], body)
+    assert torch.equal(upper.vertices, draper.drape(TOPS[0], body).vertices)
+    alone = draper.drape(TROUSERS[0], body).vertices
+    assert (lower.vertices - alone).abs().max() > 1e-5
+    _, other = draper.outfit(TOPS[3], TROUSERS[0], body)
+    assert (lower.vertices - other.vertices).abs().max() > 1e-6
+
+
+def test_gradients_reach_vertices_pose_and_shape(nets):
+    generator = torch.Generator().manual_seed(3)
+    x = TOPS[0].mesh.vertices[:40].double().requires_grad_()
+    faces = torch.arange(39).reshape(13, 3)
+    double = DrapeNets(nets.displacements("top").shape).double()
+    double.load_state_dict({k: v.double() for k, v in nets.state_dict().items()})
+    pose = (0.1 * torch.randn(1, 24, 3, generator=generator)).double().requires_grad_()
+    shape = torch.ones(1, BODY.n_shape, dtype=torch.float64, requires_grad=True)
+
+    def total(x, pose, shape):
+        body = posed_double(pose, shape)
+        ready = double.prepare(Mesh(x, faces), "top")
+        return (ready.place(ready.moved(double, "top", body), body) * torch.arange(120).reshape(40, 3)).sum()
+
+    to_x, to_pose, to_shape = torch.autograd.grad(total(x, pose, shape), (x, pose, shape))
+    way = torch.randn(24, 3, generator=generator).double()
+    slope = (total(x, pose + 1e-6 * way, shape) - total(x, pose - 1e-6 * way, shape)).item() / 2e-6
+    assert slope == pytest.approx((to_pose * way).sum().item(), rel=1e-4)
+    more = torch.randn(BODY.n_shape, generator=generator).double()
+    slope = (total(x, pose, shape + 1e-6 * more) - total(x, pose, shape - 1e-6 * more)).item() / 2e-6
+    assert slope == pytest.approx((to_shape * more).sum().item(), rel=1e-4)
+    assert to_x.abs().sum() > 0 and not double.code(Mesh(x, faces)).requires_grad
+
+
+def posed_double(pose, shape):
+    parts = ("template", "shape_dirs", "joints", "joint_dirs", "weights")
+    body = replace(BODY, **{k: getattr(BODY, k).double() for k in parts})
+    return body.pose(BodyPose(shape, pose, torch.zeros(1, 3, dtype=torch.float64)))
+
+
+def test_layer_loss_asks_the_bottom_to_be_nearer():
+    bottom, top = torch.tensor([[0.01, 0.02, 0.03]]), torch.tensor([[0.03, 0.02, 0.03]])
+    assert under_top(bottom, top, 0.8).tolist() == pytest.approx([0.004 + 0.006])
+    assert under_top(bottom, 2 * bottom, 0.8).item() == 0
+
+
+def test_waves_have_gradients_and_their_size():
+    x = torch.zeros(2, 3, requires_grad=True)
+    out = waves(x, 4)
+    assert out.shape == (2, 27)
+    out.sum().backward()
+    assert x.grad is not None and x.grad.isfinite().all()
+
+
+def test_bare_meshes_are_told_by_how_high_they_reach():
+    draper = DrapeNetDraper(DrapeNets(DrapeShape(BODY.n_shape)), 1.2)
+    assert draper.group(replace(TOPS[0], kind="")) == "top"
+    assert draper.group(replace(TROUSERS[0], kind="")) == "bottom"
+
+
+def test_groups_and_files(nets, tmp_path):
+    assert group_of("dress") == "top" and group_of("skirt") == "bottom"
+    with pytest.raises(UserError, match="hat"):
+        group_of("hat")
+    with pytest.raises(UserError, match="drapenet"):
+        load_drapenet(BODY, tmp_path)
+    card = {"shape": asdict(nets.drape["top"].shape), "body": "anny", "parts": {}}
+    write_weights("drapenet", dict(nets.state_dict()), card, tmp_path, dtype=torch.float32)
+    body, draper = posed(), load_drapenet(BODY, tmp_path)
+    expected = DrapeNetDraper(nets, 1.2).drape(TOPS[1], body).vertices
+    assert torch.allclose(draper.drape(TOPS[1], body).vertices, expected, atol=1e-5)
+    write_weights("drapenet", dict(nets.state_dict()), {**card, "body": "smpl"}, tmp_path)
+    with pytest.raises(UserError, match="learned for the body smpl"):
+        load_drapenet(BODY, tmp_path)
+    write_weights("drapenet", {"a": torch.zeros(2)}, card, tmp_path)
+    with pytest.raises(UserError, match="describe"):
+        load_drapenet(BODY, tmp_path)
