@@ -145,7 +145,8 @@ class FieldLoss:
         reach = 0.25 * torch.rand(config.points, 1, generator=generator) ** 2
         away = torch.nn.functional.normalize(torch.randn(config.points, 3, generator=generator), dim=1)
         # Vertices crowd on head and hands: half of the points come from where garments are.
-        worn = torch.cat([g.mesh.vertices for kinds in GROUPS.values() for g in coarse(kinds, config, min(16, config.garments))])
+        some = min(16, config.garments)
+        worn = torch.cat([g.mesh.vertices for kinds in GROUPS.values() for g in coarse(kinds, config, some)])
         near = worn[torch.randint(len(worn), (config.points,), generator=generator)]
         half = (torch.arange(config.points) % 2 == 0)[:, None]
         self.x = torch.where(half, near, field.vertices[at]) + torch.where(half, 0.3, 1.0) * reach * away
