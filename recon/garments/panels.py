@@ -84,7 +84,7 @@ def cut_panel(distance: NDArray) -> Panel:
     sign = clean_signs(distance, cell)
     inside = (sign < 0).view(np.int8)
     count = inside[:-1, :-1] + inside[1:, :-1] + inside[1:, 1:] + inside[:-1, 1:]
-    faces, cuts = _cut_triangles(_halves((count > 0) & (count < 4)), sign.ravel(), n * n)
+    faces, cuts = cut_triangles(_halves((count > 0) & (count < 4)), sign.ravel(), n * n)
     faces = np.concatenate([_halves(count == 4), faces])
     points, faces, rim = _place(faces, cuts, distance.ravel(), sign.ravel())
     faces, points = split_pinches(faces, points, rim)
@@ -104,7 +104,7 @@ def _rotate(triangles: NDArray, first: NDArray) -> NDArray:
     return np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, 1)
 
 
-def _cut_triangles(triangles: NDArray, sign: NDArray, base: int) -> tuple[NDArray, NDArray]:
+def cut_triangles(triangles: NDArray, sign: NDArray, base: int) -> tuple[NDArray, NDArray]:
     """Faces of the kept parts; indices from ``base`` on point into the returned cut edges (K, 2) of grid vertices."""
     t = sign[triangles]
     kept = corners(t < 0) > 0
