@@ -12,7 +12,6 @@ from recon.cloth.energies import Cloth
 from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.garments import WAISTED, GarmentDecoder, load_decoder
-from recon.garments.latents import spread
 from recon.garments.panels import waistband
 from recon.types import Garment, Mesh
 
@@ -29,19 +28,19 @@ def between(codes: Tensor, generator: torch.Generator) -> Tensor:
     return one + share * (other - one)
 
 
-def garments_of(decoder: GarmentDecoder, count: int, resolution: int, generator: torch.Generator) -> list[Garment]:
-    """``count`` garments: half of them learned codes that are far from each other, the others between learned ones."""
-    learned = [decoder.codes[k] for k in spread(decoder.codes, (count + 1) // 2)]
+def garments_of(decoder: GarmentDecoder, count: int, vertices: int, generator: torch.Generator) -> list[Garment]:
+    """``count`` garments of about so many vertices each: half random learned codes, half between learned ones."""
+    chosen = torch.randperm(len(decoder.codes), generator=generator)[: (count + 1) // 2]
+    learned = [decoder.codes[k] for k in chosen]
     codes = learned + [between(decoder.codes, generator) for _ in range(count - len(learned))]
     with torch.no_grad():
-        return [decoder.decode(code, resolution) for code in codes]
+        return [decoder.decode(code, resolution_for(decoder, code, vertices)) for code in codes]
 
 
-def resolution_for(decoder: GarmentDecoder, vertices: int) -> int:
-    """Cells of the grid that cut the mean garment into about so many vertices."""
-    with torch.no_grad():
-        found = len(decoder.decode(decoder.codes.mean(0), 64).mesh.vertices)
-    return max(16, round(64 * (vertices / found) ** 0.5))
+def resolution_for(decoder: GarmentDecoder, code: Tensor, vertices: int) -> int:
+    """Cells of the grid that cut the garment of a code (z,) into about so many vertices."""
+    found = len(decoder.decode(code, 64).mesh.vertices)
+    return max(24, round(64 * (vertices / found) ** 0.5))
 
 
 @dataclass(frozen=True)
@@ -73,4 +72,4 @@ class Wardrobe:
         """``count`` garments of a kind's shipped decoder, of about so many vertices."""
         decoder = load_decoder(kind)
         generator = torch.Generator().manual_seed(seed)
-        return cls.of(garments_of(decoder, count, resolution_for(decoder, vertices), generator), body, weights, frames)
+        return cls.of(garments_of(decoder, count, vertices, generator), body, weights, frames)

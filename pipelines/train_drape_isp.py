@@ -20,7 +20,7 @@ from pipelines.training import Budget, Training
 from recon.bodies import Body, load_body
 from recon.bodies.rig import PARENTS
 from recon.cloth.frames import FrameWeights
-from recon.draping.isp import DisplacementNet, DisplacementShape, Worn
+from recon.draping.isp import DisplacementNet, DisplacementShape, Worn, load_isp_draper
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, rest_features
 from recon.files.weights import write_weights
@@ -41,6 +41,8 @@ class TrainDrapeIsp:
     """Folder of motion clips (npz or bvh)."""
     holdout: tuple[str, ...] = HELD_OUT
     """Clips not learned from, by their files' stems."""
+    start: Path | None = None
+    """Folder with weights of the same name to go on from; the sizes below are theirs then."""
     out: Path = Path("out/weights")
     """Folder for the weights, their manifest, the log and the checkpoints."""
     minutes: float = 12.0
@@ -73,6 +75,8 @@ class TrainDrapeIsp:
     """Layers before the last."""
     collision: float = 2e4
     """Stiffness of contact with the body [J/m³ per vertex]."""
+    usual: float = 0.2
+    """Energies [J] of strain and contact above this count by their logarithm."""
     margin: float = 0.005
     """Distance from the body at which contact begins [m]."""
     pin: float = 50.0
@@ -121,6 +125,8 @@ class Loss:
     def _made(self, skinning: SkinningDraper) -> DisplacementNet:
         """The network, knowing box, joints and codes of the garments."""
         c, garments = self.config, self.wardrobe.garments
+        if c.start is not None:
+            return load_isp_draper(self.body, c.start, [c.kind]).nets[c.kind].requires_grad_(True).train()
         followed = torch.stack([skinning.bind(g.mesh.vertices, g.mesh.faces)[0].amax(0) for g in garments]).amax(0)
         box = Box.around(torch.cat([g.panel_points for g in garments]))
         shape = DisplacementShape(
@@ -151,7 +157,9 @@ class Loss:
             x = worn.bound.place(moved, body.transforms, body.shape)
             energy, terms = self.wardrobe.physics[k](x)
             off = moved[:, self.wardrobe.held[k]].square().sum((1, 2))
-            total = total + (energy + c.pin * off).mean() / c.worn
+            # Tight clothes on large bodies store many times the energy of others, and would be all that is learned.
+            level = terms["strain"] + terms["collision"] + c.usual
+            total = total + ((energy + c.pin * off) / level.to(energy)).mean() / c.worn
             for name, value in terms.items():
                 shown[name] = shown.get(name, 0.0) + float(value.mean()) / c.worn
         return total, {"loss": total.item(), **shown}
@@ -180,7 +188,7 @@ def store(net: DisplacementNet, config: TrainDrapeIsp, done: Training) -> Path:
         "data": f"{config.garments} garments of the decoder isp-{config.kind}; motion clips of {config.motions.name} "
         f"and their mirror images (held out: {', '.join(config.holdout)}), random poses within the joints' limits",
         "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
-        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions")},
+        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions", "start")},
         "seed": config.seed,
         "steps": done.step,
         "minutes": round(done.seconds / 60, 1),

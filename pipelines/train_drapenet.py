@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from pipelines.drape_garments import Wardrobe, garments_of, resolution_for
+from pipelines.drape_garments import Wardrobe, garments_of
 from pipelines.drape_training import HELD_OUT, BodySampler, Sampling, read_motions
 from pipelines.training import Budget, Training
 from recon.bodies import Body, load_body
@@ -130,7 +130,7 @@ def coarse(kinds: tuple[str, ...], config: TrainDrapenet, count: int) -> list[Ga
     out, generator = [], torch.Generator().manual_seed(config.seed)
     for kind in kinds:
         decoder = load_decoder(kind)
-        out += garments_of(decoder, count // len(kinds), resolution_for(decoder, config.vertices), generator)
+        out += garments_of(decoder, count // len(kinds), config.vertices, generator)
     return out
 
 

@@ -14,24 +14,24 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipelines.drape_garments import Wardrobe, garments_of, resolution_for
+from pipelines.drape_garments import Wardrobe, garments_of
 from pipelines.drape_training import HELD_OUT, BodySampler, Sampling, read_motions
 from pipelines.training import Budget, Training
 from recon.bodies import Body, load_body
 from recon.cloth.energies import collision
 from recon.cloth.frames import FrameWeights
 from recon.draping.isp import Worn, load_isp_draper
-from recon.draping.layering import MARGIN, Beneath, LayeringNet, Raster, repulsion, vertex_normals
+from recon.draping.layering import MARGIN, Beneath, LayeringNet, Raster, repulsion, rim_of, vertex_normals
 from recon.files.weights import write_weights
 from recon.garments import load_decoder
 from recon.types import Mesh, PosedBody, UserError
 
 OUTER = {"top": 0.65, "dress": 0.15, "skirt": 0.2}
 """How often each kind is the outer layer; legs of trousers have nowhere to go from beneath a tunic."""
-INNER = {"top": 0.4, "trousers": 0.25, "skirt": 0.15, "dress": 0.1, "body": 0.1}
+INNER = {"top": 0.35, "trousers": 0.15, "skirt": 0.1, "dress": 0.1, "body": 0.3}
 """How often each is what lies beneath."""
-WILD = 10.0
-"""Energies [J] far above this count by their root: a pair that nobody would wear must not outweigh the rest."""
+USUAL = 0.3
+"""Energies [J] above this count by their logarithm: a pair that nobody would wear must not outweigh the rest."""
 STEEP = 0.01
 """Depth [m] beneath the inner layer from which on Eq. 10's penalty grows no faster."""
 
@@ -66,7 +66,7 @@ class TrainLayersIsp:
     """Pairs of garments per step, each on all of its bodies."""
     lift: float = 0.015
     """Every other inner layer is blown up by up to so much [m]: as if there were more layers beneath it."""
-    rate: float = 1e-3
+    rate: float = 2e-3
     """Adam's learning rate at the start; decays along a cosine."""
     apart: float = 1e5
     """lambda_g of Eq. 10: stiffness of contact with the inner layer [J/m³ per vertex]."""
@@ -113,11 +113,13 @@ class Loss:
         garments = []
         for kind in self.draper.nets:
             decoder = load_decoder(kind)
-            garments += garments_of(decoder, config.garments, resolution_for(decoder, config.vertices), generator)
+            garments += garments_of(decoder, config.garments, config.vertices, generator)
         weights = FrameWeights(collision=config.collision, inextensibility=0.0, margin=0.004, deep_share=3)
         self.wardrobe = Wardrobe.of(garments, body, weights, config.bodies)
         self.worn = [Worn.of(g, self.draper.nets[g.kind], self.draper.skinning) for g in garments]
         self.rasters = [Raster.of(g) for g in garments]
+        self.rims = [rim_of(g.mesh.faces, len(g.mesh.vertices)) for g in garments]
+        self.closed = torch.zeros(len(body.rest(body.neutral().shape).vertices[0]), dtype=torch.bool)
         self.of_kind = {kind: [k for k, g in enumerate(garments) if g.kind == kind] for kind in self.draper.nets}
 
     def __call__(self, net: LayeringNet, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
@@ -126,24 +128,27 @@ class Loss:
         with torch.no_grad():
             body = self.body.pose(self.sampler(c.bodies, generator))
         self.wardrobe.physics[0].pose(body.mesh.vertices)
+        skin = Beneath.all_of(body.mesh, self.closed)
         total, shown = torch.zeros(()), dict[str, float]()
         for _ in range(c.pairs):
-            loss, terms = self._pair(net, body, generator)
+            loss, terms = self._pair(net, body, skin, generator)
             total = total + loss / c.pairs
             for name, value in terms.items():
                 shown[name] = shown.get(name, 0.0) + value / c.pairs
         return total, {"loss": total.item(), **shown}
 
-    def _pair(self, net: LayeringNet, body: PosedBody, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+    def _pair(
+        self, net: LayeringNet, body: PosedBody, skin: list[Beneath], generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
         c = self.config
         k = self._choose(OUTER, generator)
         faces = self.wardrobe.garments[k].mesh.faces
         with torch.no_grad():
             x = self._drape(k, body)
             if torch.rand((), generator=generator) < 0.3:  # in a stack, layers have been moved before
-                first = self._beneath(body, generator)
+                first = self._beneath(body, skin, generator)
                 x = net.displaced(self.rasters[k], x, repulsion(x, faces, first))[0]
-            inner = self._beneath(body, generator)
+            inner = self._beneath(body, skin, generator)
             force = repulsion(x, faces, inner)
         moved, own = net.displaced(self.rasters[k], x, force)
         energy, terms = self.wardrobe.physics[k](moved)
@@ -151,7 +156,8 @@ class Loss:
         lack = torch.stack([b.lack(p, n)[0] for b, p, n in zip(inner, moved, normals, strict=True)])
         apart = collision(lack, c.apart, STEEP)
         cost = energy + apart + c.small * own.square().sum((1, 2))
-        loss = (2 * WILD * ((1 + cost.clamp_min(0) / WILD).sqrt() - 1)).mean()
+        level = terms["strain"] + terms["collision"] + apart.detach() + USUAL
+        loss = (cost / level.to(cost)).mean()
         shown = {name: float(v.mean()) for name, v in terms.items() if name in ("strain", "bending", "collision")}
         beneath = 100 * float((lack.detach() > MARGIN).float().mean())
         return loss, {**shown, "apart": float(apart.detach().mean()), "beneath_pct": beneath}
@@ -170,17 +176,16 @@ class Loss:
         moved = worn.displaced(net(body.transforms, body.shape, worn.code))
         return worn.bound.place(moved, body.transforms, body.shape)
 
-    def _beneath(self, body: PosedBody, generator: torch.Generator) -> list[Beneath]:
+    def _beneath(self, body: PosedBody, skin: list[Beneath], generator: torch.Generator) -> list[Beneath]:
         """A random layer, every other one blown up."""
         k = self._choose(INNER, generator)
         if k < 0:
-            layer = body.mesh
-        else:
-            layer = Mesh(self._drape(k, body), self.wardrobe.garments[k].mesh.faces)
-            if torch.rand((), generator=generator) < 0.5:
-                lift = self.config.lift * float(torch.rand((), generator=generator))
-                layer = layer.with_vertices(layer.vertices + lift * vertex_normals(layer.vertices, layer.faces))
-        return [Beneath.of(x, layer.faces) for x in layer.vertices]
+            return skin
+        layer = Mesh(self._drape(k, body), self.wardrobe.garments[k].mesh.faces)
+        if torch.rand((), generator=generator) < 0.5:
+            lift = self.config.lift * float(torch.rand((), generator=generator))
+            layer = layer.with_vertices(layer.vertices + lift * vertex_normals(layer.vertices, layer.faces))
+        return Beneath.all_of(layer, self.rims[k])
 
 
 def _settings(config: TrainLayersIsp) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from recon.bodies.rig import PARENTS
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
-from recon.draping.uv import Box, Welding, basis, modes, panel_of_point, rest_features
+from recon.draping.uv import Box, Welding, around, compose, map_size, modes, panel_of_point, rest_features
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
 
@@ -71,7 +71,7 @@ def pose_features(transforms: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 class DisplacementNet(nn.Module):
-    """D_s: features of pose, shape and garment -> coefficients of both panels' displacement maps."""
+    """D_s: features of pose, shape and garment -> both panels' displacement maps."""
 
     mean: Tensor
     components: Tensor
@@ -107,20 +107,17 @@ class DisplacementNet(nn.Module):
         return (found @ self.components).clamp(-FARTHEST, FARTHEST)
 
     def forward(self, transforms: Tensor, shape: Tensor, code: Tensor) -> Tensor:
-        """Joints (B, 24, 4, 4), shapes (B, S), code (code,) -> coefficients (2, M, B, 3) [m]."""
+        """Joints (B, 24, 4, 4), shapes (B, S), code (code,) -> displacement maps (B, 3, 2, nx, ny) [m], front and back.
+
+        Their nodes cover ``shape.box``, x along the fourth axis.
+        """
         pose = pose_features(transforms, self.shape.joints)
         x = torch.cat([pose, shape, code.expand(len(pose), -1)], 1)
         h = F.silu(self.first(x))
         for k, layer in enumerate(self.inner):
             h = h + F.silu(layer(h) + (self.again(x) if k == len(self.inner) // 2 else 0))
-        return self.shape.scale * self.out(self.narrow(h)).view(len(x), 2, self.shape.modes, 3).permute(1, 2, 0, 3)
-
-    def maps(self, coefficients: Tensor, resolution: int) -> Tensor:
-        """Coefficients (2, M, B, 3) -> displacement maps (B, 2, 3, N, N) over the box [m], x along the fourth axis."""
-        axis = [torch.linspace(a, b, resolution) for a, b in zip(self.shape.box.low, self.shape.box.high, strict=True)]
-        grid = torch.stack(torch.meshgrid(*axis, indexing="ij"), -1).view(-1, 2).to(coefficients)
-        found = torch.einsum("nm,pmbd->bpdn", basis(self.shape.box, self.waves, grid), coefficients)
-        return found.unflatten(-1, (resolution, resolution))
+        found = self.shape.scale * self.out(self.narrow(h)).view(len(x), 2, self.shape.modes, 3)
+        return compose(self.shape.box, self.waves, found.permute(0, 3, 1, 2))
 
 
 @dataclass(frozen=True)
@@ -130,36 +127,33 @@ class Worn:
     bound: Bound
     """How it rides on the body."""
     faces: Tensor
-    front: Tensor
-    """(A, M) the cosines at the front panel's points."""
-    back: Tensor
-    """(P - A, M) at the back panel's."""
+    rows: Tensor
+    """(P, 4) the nodes of the maps around each panel point."""
+    shares: Tensor
+    """(P, 4)."""
     welding: Welding
-    """Points ordered front first."""
     code: Tensor
 
     @classmethod
     def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:
-        """Bind, read the rest maps, and evaluate the cosines."""
-        panel = panel_of_point(garment)
-        order = torch.argsort(panel, stable=True)
-        waves = basis(net.shape.box, net.waves, garment.panel_points[order].to(net.mean))
-        count = int((panel == 0).sum())
-        welding = Welding.of(garment)
+        """Bind, read the rest maps, and find the panel points' places on the displacement maps."""
+        box = net.shape.box
+        rows, shares = around(box, map_size(box), garment.panel_points.to(net.mean), panel_of_point(garment))
         weights, directions = skinning.bind(garment.mesh.vertices, garment.mesh.faces)
         return cls(
             Bound(garment.mesh.vertices, weights, directions),
             garment.mesh.faces,
-            waves[:count],
-            waves[count:],
-            replace(welding, vertex_of_point=welding.vertex_of_point[order]),
+            rows,
+            shares,
+            Welding.of(garment),
             net.code(garment),
         )
 
-    def displaced(self, coefficients: Tensor) -> Tensor:
-        """Coefficients (2, M, B, 3) -> displacements of the vertices at rest (B, V, 3) [m]."""
-        sides = [w @ c.flatten(1) for w, c in zip((self.front, self.back), coefficients, strict=True)]
-        return self.welding(torch.cat(sides).unflatten(1, (-1, 3)).transpose(0, 1))
+    def displaced(self, maps: Tensor) -> Tensor:
+        """Maps (B, 3, 2, nx, ny) -> displacements of the vertices at rest (B, V, 3) [m]."""
+        nodes = maps.flatten(2).flatten(0, 1).T.contiguous()
+        at_points = (nodes[self.rows] * self.shares[..., None]).sum(1)
+        return self.welding(at_points.unflatten(1, (-1, 3)).transpose(0, 1))
 
 
 class IspDraper:

@@ -48,7 +48,12 @@ def vertex_normals(x: Tensor, faces: Tensor) -> Tensor:
     out = torch.zeros_like(x)
     for k in range(3):
         out = out.index_add(-2, faces[:, k], normal)
-    return F.normalize(out, dim=-1, eps=1e-12)
+    return out * out.square().sum(-1, keepdim=True).clamp_min(1e-24).rsqrt()
+
+
+def rim_of(faces: Tensor, count: int) -> Tensor:
+    """(V,) bool, which of ``count`` vertices lie on open borders."""
+    return torch.as_tensor(open_rim(faces.cpu().numpy(), count), device=faces.device)
 
 
 @dataclass(frozen=True)
@@ -62,10 +67,17 @@ class Beneath:
     """(V,) bool, vertices on open borders."""
 
     @classmethod
-    def of(cls, x: Tensor, faces: Tensor) -> Beneath:
-        """From vertices (V, 3) [m] and faces."""
-        rim = torch.as_tensor(open_rim(faces.cpu().numpy(), len(x)), device=x.device)
+    def of(cls, x: Tensor, faces: Tensor, rim: Tensor | None = None) -> Beneath:
+        """From vertices (V, 3) [m] and faces; ``rim`` (V,) where it is known already."""
+        if rim is None:
+            rim = rim_of(faces, len(x))
         return cls(BodyContact(x.detach(), faces), vertex_normals(x.detach(), faces), rim)
+
+    @classmethod
+    def all_of(cls, layer: Mesh, rim: Tensor | None = None) -> list[Beneath]:
+        """One for each pose of a layer (B, V, 3)."""
+        rim = rim_of(layer.faces, layer.vertices.shape[1]) if rim is None else rim
+        return [cls.of(x, layer.faces, rim) for x in layer.vertices]
 
     def closest(self, x: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """For points (N, 3) and their own normals: closest points and normals there (N, 3), whether they count (N,).
@@ -183,9 +195,16 @@ def frames_of(drape: Tensor, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     along, across = slope(3), slope(4)
     side = torch.tensor([1.0, -1.0]).to(drape).view(1, 2, 1, 1, 1)
-    out = F.normalize(torch.linalg.cross(along, across, dim=2) * side, dim=2, eps=1e-9)
-    first = F.normalize(along, dim=2, eps=1e-9)
-    return along, across, torch.stack([first, torch.linalg.cross(out, first, dim=2), out], 2)
+    out, first = (
+        v * v.square().sum(2, keepdim=True).clamp_min(1e-18).rsqrt() for v in (_cross(along, across) * side, along)
+    )
+    return along, across, torch.stack([first, _cross(out, first), out], 2)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross products of maps (B, 2, 3, nx, ny)."""
+    (ax, ay, az), (bx, by, bz) = a.unbind(2), b.unbind(2)
+    return torch.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 2)
 
 
 def inputs_of(raster: Raster, x: Tensor, force: Tensor) -> tuple[Tensor, Tensor]:
@@ -288,7 +307,7 @@ class Layering:
         for i in range(-1 if body is not None else 0, len(done) - 1):
             layer = body if i < 0 else done[i]
             assert layer is not None
-            beneath = [Beneath.of(x, layer.faces) for x in layer.vertices]
+            beneath = Beneath.all_of(layer)
             for j in range(i + 1, len(done)):
                 done[j] = self.over(rasters[j], done[j], beneath)
         return done

@@ -16,6 +16,8 @@ from recon.types import Garment
 
 COARSE = 150.0
 """Eigenvalue [1/m²] of waves half a metre long: as smooth as cloth on a body mostly is."""
+SPACING = 0.01
+"""Distance of the nodes of a displacement map [m]."""
 FLAT_SCALE = 5.0
 """Factor that brings the distance between panel and body [m] to about one."""
 
@@ -56,17 +58,45 @@ def modes(box: Box, count: int) -> Tensor:
     return torch.stack([i[order], j[order]], 1)
 
 
-def basis(box: Box, which: Tensor, points: Tensor) -> Tensor:
-    """(P, M) the cosines ``which`` (M, 2) at panel points (P, 2), fine ones scaled down.
+def levels(box: Box, which: Tensor) -> Tensor:
+    """(M,) heights of the cosines ``which`` (M, 2): fine ones are scaled down.
 
     Stretching costs a wave its eigenvalue: divided by the root of it, all coefficients are about as stiff, and learning
     is not held up by the finest.
     """
-    at = math.pi * box.unit(points)
-    waves = [torch.cos(at[:, k, None] * torch.arange(int(which[:, k].max()) + 1).to(at)) for k in (0, 1)]
     frequency = math.pi * which / torch.tensor(box.size)
-    level = torch.where(which > 0, 2**0.5, 1.0).prod(1) / (1 + frequency.square().sum(1) / COARSE).sqrt()
-    return waves[0][:, which[:, 0]] * waves[1][:, which[:, 1]] * level.to(at)
+    return torch.where(which > 0, 2**0.5, 1.0).prod(1) / (1 + frequency.square().sum(1) / COARSE).sqrt()
+
+
+def map_size(box: Box) -> tuple[int, int]:
+    """Nodes along x and y of a map over a box."""
+    width, height = (math.ceil(n / SPACING) + 1 for n in box.size)
+    return width, height
+
+
+def compose(box: Box, which: Tensor, coefficients: Tensor) -> Tensor:
+    """Coefficients (..., M) of the cosines ``which`` (M, 2), at their levels -> maps (..., nx, ny) over a box."""
+    counts = [int(k) + 1 for k in which.amax(0)]
+    whole = coefficients.new_zeros(*coefficients.shape[:-1], counts[0] * counts[1])
+    at = (which[:, 0] * counts[1] + which[:, 1]).to(coefficients.device)
+    whole = whole.index_copy(-1, at, coefficients * levels(box, which).to(coefficients)).unflatten(-1, counts)
+    waves = [
+        torch.cos(math.pi * torch.linspace(0, 1, nodes)[:, None] * torch.arange(count)).to(coefficients)
+        for nodes, count in zip(map_size(box), counts, strict=True)
+    ]
+    return waves[0] @ whole @ waves[1].T
+
+
+def around(box: Box, cells: tuple[int, int], points: Tensor, panel: Tensor) -> tuple[Tensor, Tensor]:
+    """The four nodes around panel points (P, 2): rows (P, 4) of (2, nx, ny) maps flattened, and their shares (P, 4)."""
+    nx, ny = cells
+    at = box.unit(points) * points.new_tensor([nx - 1, ny - 1])
+    base = torch.minimum(at.detach().floor(), points.new_tensor([nx - 2, ny - 2])).clamp_min(0)
+    part = at - base
+    first = (panel * nx + base[:, 0].long()) * ny + base[:, 1].long()
+    rows = first[:, None] + torch.tensor([0, 1, ny, ny + 1], device=points.device)
+    x, y = part[:, :1], part[:, 1:]
+    return rows, torch.cat([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], 1)
 
 
 def panel_of_point(garment: Garment) -> Tensor:
@@ -109,17 +139,11 @@ def point_areas(garment: Garment) -> Tensor:
 
 def splat(box: Box, cells: tuple[int, int], points: Tensor, panel: Tensor, values: Tensor) -> Tensor:
     """Sums of values (P, C) at panel points, spread over the nearest nodes: (2, nx, ny, C), differentiable in all."""
-    nx, ny = cells
-    at = box.unit(points) * points.new_tensor([nx - 1, ny - 1])
-    base = torch.minimum(at.detach().floor(), points.new_tensor([nx - 2, ny - 2])).clamp_min(0)
-    part = at - base
-    first = (panel * nx + base[:, 0].long()) * ny + base[:, 1].long()
-    out = values.new_zeros(2 * nx * ny, values.shape[1])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            share = (part[:, 0] if dx else 1 - part[:, 0]) * (part[:, 1] if dy else 1 - part[:, 1])
-            out = out.index_add(0, first + dx * ny + dy, share[:, None] * values)
-    return out.view(2, nx, ny, -1)
+    rows, shares = around(box, cells, points, panel)
+    out = values.new_zeros(2 * cells[0] * cells[1], values.shape[1])
+    for k in range(4):
+        out = out.index_add(0, rows[:, k], shares[:, k, None] * values)
+    return out.view(2, *cells, -1)
 
 
 def rest_features(garment: Garment, box: Box, cells: tuple[int, int]) -> Tensor:

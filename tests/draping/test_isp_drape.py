@@ -18,7 +18,7 @@ from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.drapenet import DrapeNets, DrapeShape
 from recon.draping.isp import DisplacementNet, DisplacementShape, IspDraper, load_isp_draper, pose_features
 from recon.draping.layering import load_layering
-from recon.draping.uv import Box, basis, panel_of_point
+from recon.draping.uv import Box, panel_of_point
 from recon.files.weights import write_weights
 from recon.garments import load_decoder
 from recon.types import BodyPose, UserError
@@ -108,16 +108,14 @@ def test_the_same_garment_on_a_finer_mesh_drapes_alike(body, skirt) -> None:
     assert float((coarse - dense)[same].norm(dim=1).median()) < 0.1 * float((coarse - plain)[same].norm(dim=1).median())
 
 
-def test_maps_hold_what_points_read(body, skirt) -> None:
+def test_maps_are_read_at_the_panels_points(body, skirt) -> None:
     draper, at = draper_of(body), posed(body, 1)
-    net, worn = draper.nets["skirt"], draper.prepare(skirt)
-    found = net(at.transforms, at.shape, worn.code)
-    maps = net.maps(found, 65)
-    assert maps.shape == (1, 2, 3, 65, 65)
-    box = net.shape.box
-    node = torch.tensor([[box.low[0] + box.size[0] * 20 / 64, box.low[1] + box.size[1] * 31 / 64]])
-    wanted = (basis(box, net.waves, node) @ found[0, :, 0])[0]
-    torch.testing.assert_close(maps[0, 0, :, 20, 31], wanted, atol=1e-5, rtol=0)
+    worn = draper.prepare(skirt)
+    maps = draper.nets["skirt"](at.transforms, at.shape, worn.code)
+    assert maps.shape[:3] == (1, 3, 2)
+    plain = torch.ones_like(maps) * torch.tensor([0.01, 0.02, -0.03]).view(1, 3, 1, 1, 1)
+    wanted = torch.tensor([0.01, 0.02, -0.03]).expand(1, len(skirt.mesh.vertices), 3)
+    torch.testing.assert_close(worn.displaced(plain), wanted)
 
 
 def test_gradients_reach_the_garment_and_the_pose(body, skirt) -> None:

@@ -7,28 +7,45 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recon.draping.uv import Box, Welding, basis, modes, panel_of_point, point_areas, rest_features, splat
+from recon.draping.uv import (
+    Box,
+    Welding,
+    around,
+    compose,
+    levels,
+    map_size,
+    modes,
+    panel_of_point,
+    point_areas,
+    rest_features,
+    splat,
+)
 from recon.types import Garment
 
 BOX = Box((-0.6, 0.0), (0.6, 0.8))
-
-
-def grid(n: int) -> torch.Tensor:
-    """(n², 2) middles of the cells of the box."""
-    part = (torch.arange(n) + 0.5) / n
-    x, y = torch.meshgrid(-0.6 + 1.2 * part, 0.8 * part, indexing="ij")
-    return torch.stack([x.flatten(), y.flatten()], 1)
 
 
 def test_modes_are_smoothest_first_and_orthogonal() -> None:
     which = modes(BOX, 30)
     frequency = (which / torch.tensor(BOX.size)).norm(dim=1)
     assert which.shape == (30, 2) and which[0].tolist() == [0, 0] and (frequency.diff() > -1e-6).all()
-    waves = basis(BOX, which, grid(64))
-    gram = waves.T @ waves / len(waves)
+    maps = compose(BOX, which, torch.eye(30))
+    assert maps.shape == (30, *map_size(BOX))
+    edge = [torch.ones(n).index_fill(0, torch.tensor([0, n - 1]), 0.5) for n in maps.shape[1:]]
+    share = (edge[0][:, None] * edge[1]).flatten() / ((maps.shape[1] - 1) * (maps.shape[2] - 1))
+    gram = (maps.flatten(1) * share) @ maps.flatten(1).T
     level = gram.diagonal()
     torch.testing.assert_close(gram, level.diag(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(level.sqrt() * torch.where(which > 0, 2**0.5, 1.0).prod(1), levels(BOX, which))
     assert level[0] == pytest.approx(1.0) and (level[1:] < 1).all() and level[-1] < 0.7 * level[1]
+
+
+def test_points_between_nodes_read_what_lies_there() -> None:
+    nx, ny = map_size(BOX)
+    plane = torch.stack([torch.linspace(-0.6, 0.6, nx)[:, None].expand(nx, ny) * k for k in (1, -2)])
+    points = torch.tensor([[0.123, 0.4], [-0.31, 0.79], [0.6, 0.0]])
+    rows, shares = around(BOX, (nx, ny), points, torch.tensor([0, 1, 0]))
+    torch.testing.assert_close((plane.flatten()[rows] * shares).sum(1), torch.tensor([0.123, 0.62, 0.6]))
 
 
 def test_box_is_symmetric_and_holds_all_points() -> None:
