@@ -18,9 +18,11 @@ from torch import Tensor
 from pipelines.fit_code import CodeFit, find_code
 from pipelines.garment_source import latent_of
 from recon.files.codes import write_code
-from recon.files.meshes import write_mesh
+from recon.files.meshes import write_mesh, write_textured_glb
 from recon.files.patterns import write_svg
+from recon.files.textures import read_texture, write_png
 from recon.garments import GarmentDecoder, load_decoder
+from recon.garments.textures import Sheet, template, unsewn
 from recon.metrics import boundary_loops
 from recon.types import Garment, UserError
 
@@ -50,6 +52,10 @@ class Decode:
     """Also write the code to this .json file, which commands take as CODE."""
     pattern: Path | None = None
     """Also write the panels to this .svg file, at true scale; ``recon edit`` reads it back."""
+    texture: Path | None = None
+    """Image to put on the panels (front left, back right; twice as wide as high); for .glb files."""
+    template: Path | None = None
+    """Also write an image of the panels' outlines to draw a texture on (.png)."""
     fit: Path | None = None
     """Evidence to find the code from: a mesh (obj, ply, stl, off, glb) or points (ply, npy, xyz, txt), at rest on the
     neutral body in metres; or the garment's silhouette (png, jpg) as the neutral body wears it, seen by the camera of
@@ -72,10 +78,33 @@ def decode(config: Decode, tick: Callable[[int, float], None] | None = None) -> 
     check(config.out, config.resolution)
     if config.fit is not None and config.fit.exists() and config.out.exists() and config.fit.samefile(config.out):
         raise UserError(f"{config.out}: is the evidence; wanted another file to write")
+    if config.texture is not None and config.out.suffix.lower() != ".glb":
+        raise UserError(f"{config.out}: ends in {config.out.suffix!r}; wanted .glb with --texture")
     decoder = load_decoder(config.what[0], config.decoder, folder=config.weights)
     if config.fit is None:
-        return finish(decoder, latent_of(decoder, config.what[1]), config)
+        texture = None if config.texture is None else read_texture(config.texture)
+        latent = latent_of(decoder, config.what[1])
+        said = finish(decoder, latent, config)
+        _painted(config, decoder, latent, texture)
+        return said
     return _fitted(config, decoder, config.fit, tick)
+
+
+def _painted(config: Decode, decoder: GarmentDecoder, latent: Tensor, texture: Tensor | None) -> None:
+    """Write the template, and the garment with its texture."""
+    if texture is None and config.template is None:
+        return
+    from recon.garments.isp import IspDecoder
+
+    if not isinstance(decoder, IspDecoder):
+        raise UserError(f"decoder: found {config.decoder}; textures wanted isp")
+    sheet = Sheet.of(decoder.nets.shape)
+    with torch.no_grad():
+        garment = decoder.decode(latent, config.resolution)
+    if texture is not None:
+        write_textured_glb(unsewn(garment), sheet.coordinates(garment), texture, config.out)
+    if config.template is not None:
+        write_png(config.template, template(garment, sheet))
 
 
 def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[int, float], None] | None) -> dict:

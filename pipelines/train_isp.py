@@ -68,6 +68,10 @@ class TrainIsp:
     """The same for the codes."""
     code_noise: float = 0.0
     """Noise on the codes as a share of their spread, falling to a third: between codes must lie clothes as well."""
+    normal: float = 1.0
+    """Factor on L_normal: normals, and differences along the surface (0: Table 4 without it)."""
+    consist: float = 1.0
+    """Factor on L_consist: seams and their gaps (0: Table 4 without it)."""
     width: int = 192
     """Units per layer."""
     pattern_depth: int = 4
@@ -244,7 +248,8 @@ def surface_loss(
     sides = [joint[:, k, :, k] for k in (0, 1)]
     terms["seam"] = torch.stack([_length(side - seam_3d).mean() for side in sides]).mean()
     terms["gap"] = _length(sides[0] - sides[1]).mean()
-    weights = {"point": 1.0, "border": 0.5, "seam": 0.5, "gap": 0.5, "difference": 0.03, "normal": 0.01}
+    weights = {"point": 1.0, "border": 0.5, "seam": 0.5 * config.consist, "gap": 0.5 * config.consist}
+    weights |= {"difference": 0.03 * config.normal, "normal": 0.01 * config.normal}
     loss = sum((weights[k] * v for k, v in terms.items()), start=terms["gap"].new_zeros(()))
     names = {"point": "surface_mm", "border": "border_mm", "gap": "gap_mm", "normal": "normal"}
     return loss, {names[k]: v.detach() for k, v in terms.items() if k in names}

@@ -109,6 +109,32 @@ def write_glb(parts: Mapping[str, tuple[Mesh | Garment, Colour]], path: str | Pa
     write_whole(path, trimesh.exchange.gltf.export_glb(scene, include_normals=True))
 
 
+def write_textured_glb(mesh: Mesh, coordinates: Tensor, texture: Tensor, path: str | Path) -> None:
+    """Write one open, two-sided surface with its texture inside the file.
+
+    Args:
+        mesh: one vertex for each texture coordinate.
+        coordinates: (V, 2) in [0, 1], from left and top of the image.
+        texture: (h, w, 3) sRGB in [0, 1].
+        path: the .glb file.
+    """
+    import trimesh
+    from PIL import Image
+
+    name = Path(path).stem
+    vertices, faces = finite_vertices(mesh, name), mesh.faces.cpu().numpy()
+    picture = Image.fromarray((texture.clamp(0, 1) * 255 + 0.5).to(torch.uint8).cpu().numpy())
+    material = trimesh.visual.material.PBRMaterial(
+        name=name, baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True
+    )
+    uv = coordinates.cpu().double().numpy() * [1, -1] + [0, 1]  # trimesh counts from below
+    shape = trimesh.Trimesh(vertices, faces, vertex_normals=_normals(vertices, faces), process=False)
+    shape.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    scene = trimesh.Scene()
+    scene.add_geometry(shape, node_name=name, geom_name=name)
+    write_whole(path, trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+
+
 def linear_colour(colour: Colour) -> list[float]:
     """sRGB -> linear: glTF wants colour factors linear, people name colours in sRGB."""
     return [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
