@@ -21,6 +21,7 @@ import torch
 from isp_measures import (
     KINDS,
     RESOLUTIONS,
+    SOURCES,
     code_of,
     decode_ms,
     figures,
@@ -39,7 +40,6 @@ from recon.garments.isp import load_isp
 from recon.types import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
-SOURCES = ("pattern", "mesh", "points", "silhouette")
 
 
 def quick() -> dict:

@@ -24,6 +24,7 @@ from recon.metrics import boundary_loops, compare_meshes, panel_iou, sample_surf
 from recon.types import Garment, UserError
 
 RESOLUTIONS = (128, 256, 512)
+SOURCES = ("pattern", "mesh", "points", "silhouette")
 KINDS = ("top", "skirt", "trousers", "dress")
 SAMPLES = 5000
 POINTS = 300
