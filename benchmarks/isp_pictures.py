@@ -13,8 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from isp_measures import SOURCES, code_of
+from numpy.typing import NDArray
 from picture import ROOT, draw_panels
 
 from pipelines.edit import Edit, edit
