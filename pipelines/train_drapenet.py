@@ -23,6 +23,7 @@ from recon.bodies import Body, load_body
 from recon.cloth.frames import FrameWeights
 from recon.draping.binding import JOINTS, METHODS, BodyField
 from recon.draping.drapenet import GROUPS, DrapeNets, DrapeShape, Prepared, under_top
+from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest, read_weights, write_weights
 from recon.garments import load_decoder
 from recon.types import Garment, Mesh, PosedBody, UserError
@@ -62,6 +63,8 @@ class TrainDrapenet:
     """Bodies per step."""
     worn: int = 2
     """Garments per step (pairs, for the solver), each on all of its bodies."""
+    skinning: str = "settled"
+    """Where W and dx come from: settled or field (see ``DrapeShape``); the field part says it for all."""
     points: int = 60_000
     """Points around the body that the field is learned from."""
     shape_spread: float = 1.0
@@ -111,7 +114,7 @@ def begun(config: TrainDrapenet, body: Body) -> tuple[DrapeNets, dict]:
     if "drapenet" not in read_manifest(config.out):
         if config.part != "field":
             raise UserError(f"{config.out}: holds no drapenet; wanted --part field to be learned first")
-        shape = DrapeShape(body.n_shape)
+        shape = DrapeShape(body.n_shape, skinning=config.skinning)
         nets = DrapeNets(shape)
         garments = [g for kinds in GROUPS.values() for g in coarse(kinds, config, config.garments)]
         nets.code.know([g.mesh for g in garments], torch.Generator().manual_seed(config.seed))
@@ -180,12 +183,13 @@ class DrapeLoss:
         garments = coarse(GROUPS[self.group], config, config.garments)
         self.wardrobe = Wardrobe.of(garments, body, weights, config.bodies)
         with torch.no_grad():
-            self.ready = [nets.prepare(g.mesh, self.group) for g in garments]
+            skinning = SkinningDraper(body)
+            self.ready = [nets.prepare(g.mesh, self.group, nets.bound(g.mesh, skinning)) for g in garments]
             self.held = [trunk(g, body) if self.group == "bottom" else None for g in garments]
             self.tops = []
             if config.part == "solver":
                 tops = coarse(GROUPS["top"][:1], config, config.garments // 2)
-                self.tops = [(g, nets.prepare(g.mesh, "top")) for g in tops]
+                self.tops = [(g, nets.prepare(g.mesh, "top", nets.bound(g.mesh, skinning))) for g in tops]
 
     def __call__(self, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """The loss of one random batch, and its terms per drape [J]."""

@@ -12,7 +12,7 @@ points (:class:`RestCode`), so that any mesh at rest on the neutral body can be 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -23,6 +23,7 @@ from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import skin
 from recon.cloth.contact import BodyContact
 from recon.draping.isp import pose_features
+from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
 
@@ -76,13 +77,16 @@ class DrapeShape:
     n_shape: int
     code: int = 32
     """Size of the garments' codes; a solver's is that of both codes."""
-    terms: int = 48
+    terms: int = 32
     """N_B of §3.2.1."""
-    width: int = 160
+    width: int = 128
     depth: int = 4
     octaves: int = 5
     scale: float = 0.03
     """Displacement [m] that an output of one means."""
+    skinning: str = "settled"
+    """Where W and dx come from: ``settled``, the product's skinning, whose weights are evened out along the cloth where
+    it hangs loose; or ``field``, the learned one as in the paper, which knows nothing of the cloth."""
 
 
 class Displacements(nn.Module):
@@ -107,7 +111,7 @@ class Displacements(nn.Module):
 
     def forward(self, matrix: Tensor, body: PosedBody) -> Tensor:
         """(N_B, N, 3) of :meth:`matrix` -> displacements (B, N, 3) [m]."""
-        return torch.einsum("bk,knd->bnd", self.embedding(body), matrix)
+        return (self.embedding(body) @ matrix.flatten(1)).unflatten(1, (-1, 3))
 
 
 class RestCode(nn.Module):
@@ -176,6 +180,10 @@ class Prepared:
         return skin(shaped + moved, body.transforms, self.weights)
 
 
+Bound = tuple[Tensor, Tensor]
+"""Skinning weights (N, 24) and shape directions (N, 3, S) [m] of a garment's vertices."""
+
+
 class DrapeNets(nn.Module):
     """All networks: the body's field, codes, one draping network a group, and the solver."""
 
@@ -184,8 +192,8 @@ class DrapeNets(nn.Module):
         self.field = BodyFieldNet(shape.n_shape)
         self.code = RestCode(size=shape.code)
         self.drape = nn.ModuleDict({group: Displacements(shape) for group in GROUPS})
-        solver = DrapeShape(shape.n_shape, 2 * shape.code, 24, 96, 3, shape.octaves, shape.scale)
-        self.solver = Displacements(solver)
+        self.shape = shape
+        self.solver = Displacements(replace(shape, code=2 * shape.code, terms=24, width=96, depth=3))
 
     def displacements(self, group: str) -> Displacements:
         """The network of a group."""
@@ -193,14 +201,22 @@ class DrapeNets(nn.Module):
         assert isinstance(net, Displacements)
         return net
 
-    def prepare(self, mesh: Mesh, group: str, above: Tensor | None = None) -> Prepared:
-        """A mesh at rest on the neutral body, made ready; ``above`` (z,): code of the garment over it, for the solver.
+    def bound(self, mesh: Mesh, skinning: SkinningDraper) -> Bound | None:
+        """Skinning of a mesh as these networks learned it; None = the learned field's."""
+        return skinning.bind(mesh.vertices, mesh.faces) if self.shape.skinning == "settled" else None
 
-        Differentiable in the mesh's vertices, the code held.
+    def prepare(self, mesh: Mesh, group: str, bound: Bound | None = None, above: Tensor | None = None) -> Prepared:
+        """A mesh at rest on the neutral body, made ready.
+
+        Args:
+            mesh: (N, 3) vertices; differentiable in them, the code held.
+            group: key of ``GROUPS``.
+            bound: skinning weights (N, 24) and shape directions (N, 3, S); None = the learned field's.
+            above: (z,) code of the garment over it, for the solver.
         """
         x = mesh.vertices
         code = self.code(mesh)
-        weights, directions = self.field(x)
+        weights, directions = self.field(x) if bound is None else bound
         matrix = self.displacements(group).matrix(x, code)
         solved = None if above is None else self.solver.matrix(x, torch.cat([above, code]))
         return Prepared(x, weights, directions, matrix, code, solved)
@@ -217,25 +233,30 @@ def group_of(kind: str) -> str:
 class DrapeNetDraper:
     """A ``Draper``: any garment of the groups, decoded or a user's mesh."""
 
-    def __init__(self, nets: DrapeNets, chest: float):
-        """``chest``: height of the neutral body's chest [m]: meshes of no known kind that end above it are tops."""
+    def __init__(self, nets: DrapeNets, body):
+        """``body``: the ``recon.bodies`` body that they learned on."""
         self.nets = nets.eval().requires_grad_(False)
-        self.chest = chest
+        self.skinning = SkinningDraper(body)
+        self.chest = float(body.rest_joints(body.neutral().shape)[0, CHEST, 1])
         self._last: tuple[Tensor, str, Prepared] | None = None
 
     def group(self, garment: Garment) -> str:
-        """The network that drapes a garment: by its kind, or for a bare mesh by how high it reaches."""
+        """The network that drapes a garment: by its kind, or for a bare mesh by whether it reaches the chest."""
         if garment.kind:
             return group_of(garment.kind)
         return "top" if float(garment.mesh.vertices.detach()[:, 1].max()) > self.chest else "bottom"
+
+    def bound(self, mesh: Mesh) -> Bound | None:
+        """Skinning of a mesh as the networks learned it; None = the learned field's."""
+        return self.nets.bound(mesh, self.skinning)
 
     def prepared(self, garment: Garment) -> Prepared:
         """The garment made ready; the last one is remembered where no gradient is asked for."""
         rest, group = garment.mesh, self.group(garment)
         if rest.vertices.requires_grad and torch.is_grad_enabled():
-            return self.nets.prepare(rest, group)
+            return self.nets.prepare(rest, group, self.bound(rest))
         if self._last is None or self._last[0] is not rest.vertices or self._last[1] != group:
-            self._last = rest.vertices, group, self.nets.prepare(rest, group)
+            self._last = rest.vertices, group, self.nets.prepare(rest, group, self.bound(rest))
         return self._last[2]
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
@@ -247,7 +268,7 @@ class DrapeNetDraper:
     def outfit(self, top: Garment, bottom: Garment, body: PosedBody) -> tuple[Mesh, Mesh]:
         """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9)."""
         group, above = self.group(bottom), self.prepared(top).code
-        ready = self.nets.prepare(bottom.mesh, group, above)
+        ready = self.nets.prepare(bottom.mesh, group, self.bound(bottom.mesh), above)
         lower = ready.place(ready.moved(self.nets, group, body), body)
         return self.drape(top, body), Mesh(lower, bottom.mesh.faces)
 
@@ -266,8 +287,7 @@ def load_drapenet(body, folder: str | Path | None = None) -> DrapeNetDraper:
         raise UserError(f"drapenet: weights and card don't describe draping networks ({error})") from error
     if body.n_shape != weights.card["shape"]["n_shape"] or body.name != weights.card["body"]:
         raise UserError(f"drapenet: learned for the body {weights.card['body']}; found {body.name}")
-    chest = float(body.rest_joints(body.neutral().shape)[0, CHEST, 1])
-    return DrapeNetDraper(nets.to(body.weights.device), chest)
+    return DrapeNetDraper(nets.to(body.weights.device), body)
 
 
 def under_top(bottom: Tensor, top: Tensor, gamma: float) -> Tensor:

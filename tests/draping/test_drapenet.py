@@ -42,7 +42,7 @@ def posed(batch: int = 2):
 
 
 def test_shapes_and_any_mesh(nets):
-    draper, body = DrapeNetDraper(nets, 1.2), posed()
+    draper, body = DrapeNetDraper(nets, BODY), posed()
     for garment in (TOPS[0], TROUSERS[0]):
         out = draper.drape(garment, body)
         assert out.vertices.shape == (2, len(garment.mesh.vertices), 3) and out.vertices.isfinite().all()
@@ -98,7 +98,7 @@ def test_codes_of_few_garments():
 
 
 def test_the_solver_moves_the_bottom_alone_and_knows_both_codes(nets):
-    draper, body = DrapeNetDraper(nets, 1.2), posed()
+    draper, body = DrapeNetDraper(nets, BODY), posed()
     upper, lower = draper.outfit(TOPS[0], TROUSERS[0], body)
     assert torch.equal(upper.vertices, draper.drape(TOPS[0], body).vertices)
     alone = draper.drape(TROUSERS[0], body).vertices
@@ -152,7 +152,7 @@ def test_waves_have_gradients_and_their_size():
 
 
 def test_bare_meshes_are_told_by_how_high_they_reach():
-    draper = DrapeNetDraper(DrapeNets(DrapeShape(BODY.n_shape)), 1.2)
+    draper = DrapeNetDraper(DrapeNets(DrapeShape(BODY.n_shape)), BODY)
     assert draper.group(replace(TOPS[0], kind="")) == "top"
     assert draper.group(replace(TROUSERS[0], kind="")) == "bottom"
 
@@ -166,7 +166,7 @@ def test_groups_and_files(nets, tmp_path):
     card = {"shape": asdict(nets.drape["top"].shape), "body": "anny", "parts": {}}
     write_weights("drapenet", dict(nets.state_dict()), card, tmp_path, dtype=torch.float32)
     body, draper = posed(), load_drapenet(BODY, tmp_path)
-    expected = DrapeNetDraper(nets, 1.2).drape(TOPS[1], body).vertices
+    expected = DrapeNetDraper(nets, BODY).drape(TOPS[1], body).vertices
     assert torch.allclose(draper.drape(TOPS[1], body).vertices, expected, atol=1e-5)
     write_weights("drapenet", dict(nets.state_dict()), {**card, "body": "smpl"}, tmp_path)
     with pytest.raises(UserError, match="learned for the body smpl"):

@@ -1,0 +1,275 @@
+"""DrapeNet's Tables 1 and 2 on garments, bodies and poses that no training saw, and its times.
+
+    python benchmarks/drapenet.py                      # to docs/results/drapenet.json and drapenet.md
+    python benchmarks/drapenet.py --quick              # within a minute; one JSON object last
+    python benchmarks/drapenet.py --weights DIR        # networks of your own training
+
+Garments are the test split at its own meshing, as a user's mesh would come; bodies are the population's, half of them
+in poses of the held-out clip where it is at hand. Every way of draping meets the same cases:
+
+- drapenet: Eq. 6 whole; bottoms under a top with and without the intersection solver (Eq. 9);
+- skinning: Eq. 6 without dx_ref: the product's geometry-aware skinning, settled along the cloth, which the networks
+  learned on (``DrapeShape.skinning``);
+- field: the same with the skinning field that is learned from the body alone, as in the paper.
+
+B2G: share of the garment's area with its middle inside the body. G2G: share of the bottom's area outside of the top
+that covers it. ED: mean distance of vertices from the simulator's drape (``recon.draping.dress``), which is one of many
+good ones. Energies are those that networks learn from, gravity above the body's lowest point.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from isp_layers import ROOT, unseen_bodies
+
+from recon.bodies import Body, load_body
+from recon.cloth.contact import BodyContact
+from recon.cloth.energies import Cloth, bending, gravity, stvk
+from recon.draping.drapenet import DrapeNetDraper, Prepared, load_drapenet
+from recon.draping.dress import dress
+from recon.draping.layering import Beneath
+from recon.draping.skinning import SkinningDraper
+from recon.files.weights import read_manifest
+from recon.garments.dataset import load_garments
+from recon.metrics import areas_and_middles, inside_pct
+from recon.types import BodyPose, Garment, Mesh, PosedBody
+
+GROUPS = {"top": ("top", "dress"), "bottom": ("trousers", "skirt")}
+WAYS = ("drapenet", "field", "skinning")
+TERMS = ("strain", "bending", "gravity")
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured."""
+
+    garments: int
+    """Test garments of each kind."""
+    bodies: int
+    """Bodies that each is draped on."""
+    pairs: int
+    """Tops over bottoms."""
+    simulated: int
+    """Of the garments of each kind, so many on one body against the simulator."""
+    repeats: int
+    """Timings."""
+
+
+FULL, QUICK = Size(10, 4, 10, 2, 9), Size(1, 2, 2, 0, 3)
+
+
+def ways(draper: DrapeNetDraper, skinning: SkinningDraper) -> dict[str, Callable[[Garment, PosedBody], Mesh]]:
+    """Name -> how a garment is draped."""
+
+    def field(garment: Garment, body: PosedBody) -> Mesh:
+        ready = draper.nets.prepare(garment.mesh, draper.group(garment))
+        none = torch.zeros(len(body.shape), len(ready.rest), 3)
+        return Mesh(ready.place(none, body), garment.mesh.faces)
+
+    return {"drapenet": draper.drape, "field": field, "skinning": skinning.drape}
+
+
+def energies(cloth: Cloth, x: torch.Tensor, floor: float) -> dict[str, float]:
+    """Strain, bending, gravity above ``floor``, and their sum [J]."""
+    ground = x - x.new_tensor([0.0, floor, 0.0])
+    found = {"strain": float(stvk(cloth, x)), "bending": float(bending(cloth, x))}
+    found["gravity"] = float(gravity(cloth, ground))
+    return found | {"total": sum(found.values())}
+
+
+def alone(size: Size, body: Body, how: dict[str, Callable]) -> list[dict]:
+    """Each garment on each body by each way: B2G [%] and energies [J], one row each."""
+    rows = []
+    for number, kind in enumerate(k for kinds in GROUPS.values() for k in kinds):
+        posed = body.pose(unseen_bodies(size.bodies, body, number))
+        contacts = [BodyContact(v, body.faces) for v in posed.mesh.vertices]
+        for garment in load_garments(kind, "test")[: size.garments]:
+            cloth = Cloth.from_garment(garment)
+            for way, drape in how.items():
+                worn = drape(garment, posed)
+                for x, skin, contact in zip(worn.vertices, posed.mesh.vertices, contacts):
+                    found = {"b2g_pct": inside_pct(Mesh(x, worn.faces), contact)}
+                    rows.append({"kind": kind, "way": way, **found, **energies(cloth, x, float(skin[:, 1].min()))})
+    return rows
+
+
+def outside_pct(bottom: Mesh, top: Mesh) -> float:
+    """Share of the bottom's area outside of the top that it should be under."""
+    area, middle, normal = areas_and_middles(bottom)
+    on, out, counts = Beneath.of(top.vertices, top.faces).closest(middle, normal)
+    wrong = counts & (((middle - on) * out).sum(1) > 0)
+    return 100 * float(area[wrong].sum() / area.sum())
+
+
+def pairs(size: Size, body: Body, draper: DrapeNetDraper, skinning: SkinningDraper) -> list[dict]:
+    """Tops over bottoms: G2G [%] and the bottom's B2G [%] with the solver, without it, and by skinning."""
+    tops = sorted(load_garments("top", "test"), key=lambda g: float(g.mesh.vertices[:, 1].min()))
+    bottoms = [g for kind in GROUPS["bottom"] for g in load_garments(kind, "test")]
+    bottoms.sort(key=lambda g: -float(g.mesh.vertices[:, 1].max()))
+    rows = []
+    for k in range(size.pairs):
+        top, bottom = tops[k % len(tops)], bottoms[k % len(bottoms)]  # long tops over high waists: those overlap
+        posed = body.pose(unseen_bodies(1, body, 50 + k))
+        contact = BodyContact(posed.mesh.vertices[0], body.faces)
+        over, under = draper.outfit(top, bottom, posed)
+        for way, (upper, lower) in {
+            "solver": (over, under),
+            "alone": (over, draper.drape(bottom, posed)),
+            "skinning": (skinning.drape(top, posed), skinning.drape(bottom, posed)),
+        }.items():
+            lower, upper = (m.with_vertices(m.vertices[0]) for m in (lower, upper))
+            rows.append({"way": way, "g2g_pct": outside_pct(lower, upper), "b2g_pct": inside_pct(lower, contact)})
+    return rows
+
+
+def simulated(size: Size, body: Body, how: dict[str, Callable], skinning: SkinningDraper) -> list[dict]:
+    """ED [mm] of each way from the simulator's drape."""
+    rows = []
+    for number, kind in enumerate(k for kinds in GROUPS.values() for k in kinds):
+        for k, garment in enumerate(load_garments(kind, "test")[: size.simulated]):
+            place = unseen_bodies(1, body, 80 + 10 * number + k)
+            truth = torch.from_numpy(dress([garment], body, place, skinning)[0]).float()
+            posed = body.pose(place)
+            for way, drape in how.items():
+                away = (drape(garment, posed).vertices[0] - truth).norm(dim=1)
+                rows.append({"kind": kind, "way": way, "ed_mm": 1e3 * float(away.mean())})
+    return rows
+
+
+def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
+    """Milliseconds: a code, and a drape with everything anew and with the garment made ready, by vertices."""
+    garment = load_garments("top", "test")[0]
+    posed = body.pose(BodyPose(*(t[:1] for t in vars(unseen_bodies(2, body, 7)).values())))
+    found: dict = {"drape_ms": {}, "drape_ready_ms": {}}
+    found["encode_ms"] = _timed(lambda: draper.nets.code(garment.mesh), size.repeats)
+    for name, count in (("5k", 5_000), ("100k", 100_000)):
+        pick = torch.arange(count) % len(garment.mesh.vertices)
+        x = garment.mesh.vertices[pick] + 1e-3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+        code = draper.nets.code(garment.mesh)
+
+        def ready(x=x, code=code) -> Prepared:
+            weights, directions = draper.nets.field(x)
+            return Prepared(x, weights, directions, draper.nets.displacements("top").matrix(x, code), code)
+
+        def place(made: Prepared) -> torch.Tensor:
+            return made.place(made.moved(draper.nets, "top", posed), posed)
+
+        made = ready()
+        found["drape_ms"][name] = _timed(lambda: place(ready()), size.repeats)
+        found["drape_ready_ms"][name] = _timed(lambda made=made: place(made), size.repeats)
+    return found
+
+
+def _timed(function: Callable, repeats: int) -> float:
+    """Median wall time [ms], after one call that warms up."""
+    function()
+    taken = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        function()
+        taken.append(1e3 * (time.perf_counter() - begin))
+    return round(statistics.median(taken), 2)
+
+
+def means(rows: list[dict], keys: tuple[str, ...], by: str = "way") -> dict[str, dict[str, float]]:
+    """Group -> mean of each key."""
+    out: dict[str, dict[str, float]] = {}
+    for value in dict.fromkeys(r[by] for r in rows):
+        mine = [r for r in rows if r[by] == value]
+        out[value] = {k: round(statistics.fmean(r[k] for r in mine), 4) for k in keys}
+    return out
+
+
+def decoder_figures(quick: bool) -> dict:
+    """The generative network's figures, by its own benchmark, where that is there."""
+    try:
+        return importlib.import_module("udf").measure(quick)
+    except ModuleNotFoundError:
+        return {}
+
+
+@torch.no_grad()
+def run(size: Size, weights: Path | None, quick: bool) -> dict:
+    """Everything, as one JSON object."""
+    body = load_body()
+    draper, skinning = load_drapenet(body, weights), SkinningDraper(body)
+    how, keys = ways(draper, skinning), ("b2g_pct", *TERMS, "total")
+    rows = alone(size, body, how)
+    table = {g: means([r for r in rows if r["kind"] in kinds], keys) for g, kinds in GROUPS.items()}
+    over = means(pairs(size, body, draper, skinning), ("g2g_pct", "b2g_pct"))
+    drapes = simulated(size, body, how, skinning)
+    ed = {g: means([r for r in drapes if r["kind"] in kinds], ("ed_mm",)) for g, kinds in GROUPS.items()}
+    parts = read_manifest(weights)["drapenet"]["parts"]
+    ratio = {g: round(t["drapenet"]["strain"] / t["skinning"]["strain"], 4) for g, t in table.items()}
+    with torch.enable_grad():
+        decoder = decoder_figures(quick)
+    return {
+        **decoder,
+        "b2g_pct": {g: t["drapenet"]["b2g_pct"] for g, t in table.items()},
+        "g2g_pct": {way: found["g2g_pct"] for way, found in over.items()},
+        "strain_ratio": ratio,
+        "table1": {"draped": table, "pairs": over, "ed": ed},
+        "kinds": {k: means([r for r in rows if r["kind"] == k], keys) for v in GROUPS.values() for k in v},
+        **{"code_ms" if k == "encode_ms" and decoder else k: v for k, v in times(size, body, draper).items()},
+        "trained": {name: {"minutes": p["minutes"], "steps": p["steps"]} for name, p in parts.items()},
+        "size": vars(size),
+        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}",
+    }
+
+
+def page(found: dict) -> str:
+    """The figures as Markdown."""
+    lines = ["# DrapeNet's draping, measured", "", f"`python benchmarks/drapenet.py` on {found['machine']}.", ""]
+    taught = ", ".join(f"{k} {v['minutes']} min ({v['steps']} steps)" for k, v in found["trained"].items())
+    lines += [f"Learned for: {taught}, on one busy core.", "", __doc__.partition("\n\n    ")[0].strip(), ""]
+    lines += ["## Bodies and energies (Tables 1 and 2)", ""]
+    lines += [
+        "| garments | way | B2G % | strain J | bending J | gravity J | total J |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for group, ways_ in found["table1"]["draped"].items():
+        for way, f in ways_.items():
+            cells = " | ".join(f"{f[k]:.3f}" for k in ("b2g_pct", *TERMS, "total"))
+            lines.append(f"| {group} | {way} | {cells} |")
+    lines += ["", "Paper: B2G 0.9 (tops), 0.3 (bottoms); strain 0.43 and 0.41 J, total 1.81 and 1.28 J.", ""]
+    lines += ["## Top over bottom", "", "| way | G2G % | bottom's B2G % |", "|---|---|---|"]
+    for way, f in found["table1"]["pairs"].items():
+        lines.append(f"| {way} | {f['g2g_pct']:.3f} | {f['b2g_pct']:.3f} |")
+    lines += ["", "Paper: G2G 0.5 with the solver, 1.1 without.", ""]
+    if any(found["table1"]["ed"].values()):
+        lines += ["## Against the simulator", "", "| garments | way | ED mm |", "|---|---|---|"]
+        for group, ways_ in found["table1"]["ed"].items():
+            lines += [f"| {group} | {way} | {f['ed_mm']:.1f} |" for way, f in ways_.items()]
+    lines += ["", "## Times", "", f"Drape, everything anew: {found['drape_ms']} ms; garment made ready before: "]
+    lines[-1] += f"{found['drape_ready_ms']} ms."
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure; write the results, or print one JSON object last."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    found = run(QUICK if args.quick else FULL, args.weights, args.quick)
+    if not args.quick:
+        out = ROOT / "docs" / "results"
+        (out / "drapenet.json").write_text(json.dumps(found, indent=1) + "\n")
+        (out / "drapenet.md").write_text(page(found))
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
