@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 
@@ -31,6 +32,12 @@ WORSE = 2.0
 """So many times as many crossings as at best mean that steps are too long."""
 PATIENCE = 10
 """So many rounds without much progress, then pockets are laid across their curves."""
+ASTRAY = -0.2
+"""Cosine between cloth's outside and the body's nearest way out below which that way is the wrong one."""
+STRIDE = 0.01
+"""Longest move through the body towards the right side of it [m]."""
+SMOOTHING = 8
+"""Times that normals are averaged with their neighbours'."""
 CALMEST = 0.1
 """Where steps had to be made shorter than this share, there is no way out."""
 
@@ -109,6 +116,7 @@ class _Tangle:
         self.scale = float(self.lengths.mean())
         self.rims = self._rims()
         self.pockets = Pockets(self.crossings, self.x, self.layer)
+        self.outward = self._outward()
         self.body = None
         self.asked: NDArray | None = None
         self.temper = 1.0  # factor on the steps against the curve
@@ -122,6 +130,20 @@ class _Tangle:
         rim = np.zeros(len(self.x), bool)
         rim[open_edges] = True
         return rim
+
+    def _outward(self) -> NDArray:
+        """(V + F, 3) where outside is for the cloth as it came, at vertices and face centres, smoothed over folds."""
+        a, b, c = (self.x[self.faces[:, k]] for k in range(3))
+        count = len(self.x)
+        normal = np.zeros_like(self.x)
+        np.add.at(normal, self.faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, 0))
+        i, j = np.concatenate([self.edges, self.edges[:, ::-1]]).T
+        around = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
+        for _ in range(SMOOTHING):
+            normal += around @ normal
+            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
+        middle = normal[self.faces].mean(1)
+        return np.concatenate([normal, middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-15)])
 
     def solve(self) -> Untangled:
         """Rounds until nothing is left; where it grows worse, back to the best so far with smaller steps."""
@@ -227,7 +249,11 @@ class _Tangle:
             lack = np.maximum(wanted - distance, 0) * (1.05 + 3 * late)
             if not lack.any():
                 break
-            move = lack[:, None] * normal
+            # The nearest way out of an arm may lead to its other side: cloth leaves to where its own outside is.
+            astray = (normal * self.outward[near]).sum(1) < ASTRAY
+            move = np.where(
+                astray[:, None], np.minimum(lack, STRIDE)[:, None] * self.outward[near], lack[:, None] * normal
+            )
             own = (near < n) & (lack > 0)
             self.x[near[own]] += move[own]
             by_face = (near >= n) & (lack > 0)
@@ -263,7 +289,10 @@ class _Tangle:
         wrong = (sign < 0) & (distance < s.reach) & (distance > 1e-9)
         wrong &= ~(self.rims[corners] | (weights < 1e-3)).all(1)  # beside an open border there are no sides
         at = np.flatnonzero(wrong)
-        push = -away[at] / distance[at, None] * (distance[at] + s.gap)[:, None]
+        size = (distance[at] + s.gap)[:, None]
+        push, own = -away[at] / distance[at, None], self.outward[at + self.starts[k]]
+        astray = (push * own).sum(1, keepdims=True) < ASTRAY
+        push = np.where(astray, own * np.minimum(size, STRIDE), push * size)
         vertices = np.concatenate([at + self.starts[k], corners[at].ravel()])
         # The corners share the inner's half; weights squared make the point itself move by it.
         share = weights[at] / np.maximum((weights[at] ** 2).sum(1, keepdims=True), 1e-9)
