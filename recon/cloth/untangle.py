@@ -34,6 +34,16 @@ PATIENCE = 10
 """So many rounds without much progress, then pockets are laid across their curves."""
 ASTRAY = -0.2
 """Cosine between cloth's outside and the body's nearest way out below which that way is the wrong one."""
+FARTHEST = 0.1
+"""Where little else helps layers are recognised this deep in each other [m]."""
+OWN_RINGS = 2
+"""So many times only a layer's crossings with itself are laid flat, then all."""
+MOST_RINGS = 6
+"""Widest surroundings of crossings that are laid flat, in rings of edges."""
+BEHIND = 20
+"""So far behind cloth the body is searched for beginning anew [cm]."""
+PAD = 2e-3
+"""How wrong remembered distances may be: beside sharp creases signs are not sure [m]."""
 STRIDE = 0.01
 """Longest move through the body towards the right side of it [m]."""
 SMOOTHING = 8
@@ -119,6 +129,7 @@ class _Tangle:
         self.outward = self._outward()
         self.body = None
         self.asked: NDArray | None = None
+        self.rings = 0
         self.temper = 1.0  # factor on the steps against the curve
         self.known = np.zeros(0)
         if body is not None:
@@ -190,11 +201,22 @@ class _Tangle:
         """Pockets that poke through other cloth are laid across the curve where they do."""
         crossing = np.zeros(len(self.edges), bool)
         crossing[found[:, 0]] = True
-        free = self.pockets.find(crossing)
+        free = self.pockets.find(crossing) | self._crumpled(found)
         self.x = laid_across(self.x, self.edges, free, self.settings.gap)
         mine = free[self.edges].any(1)
         ends = self.x[self.edges[mine]]
         self.lengths[mine] = np.minimum(self.lengths[mine], np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1))
+
+    def _crumpled(self, found: NDArray) -> NDArray:
+        """(V,) where a layer passes through itself, later through any, and each time it is asked a ring more."""
+        self.rings += 1
+        edge, face = self.edges[found[:, 0]], self.faces[found[:, 1]]
+        own = (self.layer[edge[:, 0]] == self.layer[face[:, 0]]) | (self.rings > OWN_RINGS)
+        out = np.zeros(len(self.x), bool)
+        out[edge[own]] = out[face[own]] = True
+        for _ in range(min(self.rings, MOST_RINGS)):
+            out[self.edges[out[self.edges].any(1)]] = True
+        return out
 
     def _notes(self, left: NDArray, inside: int) -> tuple[str, ...]:
         lines = []
@@ -229,7 +251,7 @@ class _Tangle:
             near = np.arange(len(points))
             self.asked, self.known = points.copy(), np.zeros(len(points))
         else:
-            near = np.flatnonzero(self.known - np.linalg.norm(points - self.asked, axis=1) < wanted)
+            near = np.flatnonzero(self.known - np.linalg.norm(points - self.asked, axis=1) < wanted + PAD)
         at = torch.from_numpy(points[near]).requires_grad_()
         distance = self.body.signed_distance(at)
         (normal,) = torch.autograd.grad(distance.sum(), at)
@@ -249,11 +271,8 @@ class _Tangle:
             lack = np.maximum(wanted - distance, 0) * (1.05 + 3 * late)
             if not lack.any():
                 break
-            # The nearest way out of an arm may lead to its other side: cloth leaves to where its own outside is.
-            astray = (normal * self.outward[near]).sum(1) < ASTRAY
-            move = np.where(
-                astray[:, None], np.minimum(lack, STRIDE)[:, None] * self.outward[near], lack[:, None] * normal
-            )
+            astray = self._astray(near, distance, normal)[:, None]
+            move = np.where(astray, np.minimum(lack, STRIDE)[:, None] * self.outward[near], lack[:, None] * normal)
             own = (near < n) & (lack > 0)
             self.x[near[own]] += move[own]
             by_face = (near >= n) & (lack > 0)
@@ -262,6 +281,25 @@ class _Tangle:
             moved[near[own]] = True
             moved[corners] = True
         return moved
+
+    def _astray(self, near: NDArray, distance: NDArray, normal: NDArray) -> NDArray:
+        """(K,) points whose nearest way out of the body leads to the wrong side: of a sleeve, the arm's other side.
+
+        They leave to where the cloth's own outside is. Not so where behind the way out the body begins anew: that is
+        cloth of the trunk in an arm, which goes back.
+        """
+        assert self.body is not None
+        outward = self.outward[near]
+        astray = (distance < 0) & ((normal * outward).sum(1) < ASTRAY)
+        rows = np.flatnonzero(astray)
+        if len(rows):
+            points = np.concatenate([self.x, self.x[self.faces].mean(1)])[near[rows]]
+            way = np.arange(1, BEHIND + 1)[:, None] * 0.01
+            behind = points[:, None] - way * outward[rows, None]
+            inside = self.body.penetrating(torch.from_numpy(behind.reshape(-1, 3))).numpy().reshape(len(rows), -1)
+            out = np.logical_or.accumulate(~inside, 1)
+            astray[rows[(out & inside).any(1)]] = False
+        return astray
 
     def _scatter(self, vertices: NDArray, moves: NDArray) -> None:
         """Add the mean of the moves asked for at each vertex."""
@@ -286,13 +324,11 @@ class _Tangle:
         corners = faces[face] + self.starts[j]
         away = self.x[outer] - (self.x[corners] * weights[..., None]).sum(1)
         distance = np.linalg.norm(away, axis=1)
-        wrong = (sign < 0) & (distance < s.reach) & (distance > 1e-9)
+        wrong = (sign < 0) & (distance < min(s.reach * (1 + self.rings), FARTHEST)) & (distance > 1e-9)
         wrong &= ~(self.rims[corners] | (weights < 1e-3)).all(1)  # beside an open border there are no sides
         at = np.flatnonzero(wrong)
         size = (distance[at] + s.gap)[:, None]
-        push, own = -away[at] / distance[at, None], self.outward[at + self.starts[k]]
-        astray = (push * own).sum(1, keepdims=True) < ASTRAY
-        push = np.where(astray, own * np.minimum(size, STRIDE), push * size)
+        push = -away[at] / distance[at, None] * size
         vertices = np.concatenate([at + self.starts[k], corners[at].ravel()])
         # The corners share the inner's half; weights squared make the point itself move by it.
         share = weights[at] / np.maximum((weights[at] ** 2).sum(1, keepdims=True), 1e-9)
