@@ -117,6 +117,7 @@ COMMANDS = {
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
+    "train udf": Command("learn encoder and decoder of open meshes", "pipelines.train_udf", "TrainUdf", "train_udf"),
     "train gaps": Command("learn to drape a garment in motion", "pipelines.train_gaps", "TrainGaps", "train_gaps"),
     "train drape-isp": Command(
         "learn to drape a kind of garment", "pipelines.train_drape_isp", "TrainDrapeIsp", "train_drape_isp"

@@ -35,7 +35,7 @@ NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
 WAISTED = ("trousers", "skirt")
 """Kinds that a waistband holds up."""
 
-DECODERS: dict[str, str] = {"isp": "recon.garments.isp:load_isp"}
+DECODERS: dict[str, str] = {"isp": "recon.garments.isp:load_isp", "udf": "recon.garments.udf:load_udf"}
 """Decoder name -> ``module:function`` of (kind, folder, device)."""
 
 

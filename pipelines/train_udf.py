@@ -1,0 +1,236 @@
+"""Train the garment generative network (DrapeNet §3.1, Eq. 1-5): ``recon train udf --family upper``.
+
+Encoder and decoder learn together: points of a garment give its code, the code gives the field, and the field is held
+against exact distances and gradients. The encoder is slow on a CPU and its codes say little at first, so in the compact
+training only some garments of a batch go through it; the others have their aim for a code, principal components of
+distances, which the encoder learns to meet. With ``encoded`` = ``batch`` and ``aim`` = 0 it is the paper's training.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from pipelines.training import Budget, Training
+from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect
+from recon.files.weights import write_weights
+from recon.garments.dataset import Item, load_items
+from recon.garments.udf import FAMILIES, Known, UdfDecoder
+from recon.garments.udf_net import UdfNets, UdfShape
+from recon.types import UserError
+
+
+@dataclass(frozen=True)
+class TrainUdf:
+    """Settings of one training."""
+
+    family: str
+    """Garment family: upper (tops and dresses) or lower (trousers and skirts)."""
+    data: Path | None = None
+    """Folder of the garment data set (<kind>_train.npz, <kind>_test.npz); the one that ships if not given."""
+    out: Path = Path("out/weights")
+    """Folder for the weights, their manifest, the log and the checkpoints."""
+    minutes: float = 18.0
+    """Training time [minutes], preparation and evaluation not counted."""
+    steps: int = 0
+    """Train so many steps instead of so many minutes; 0 = by the clock."""
+    seed: int = 0
+    """Seed of initialisation and sampling."""
+    threads: int = 2
+    """CPU threads."""
+    garments: int = 0
+    """Train on the first so many garments of each kind only; 0 = all."""
+    size: Literal["compact", "paper"] = "compact"
+    """Networks that train on a CPU core, or those of the paper (days on a CPU)."""
+    head: Literal["pair", "sigmoid"] = "pair"
+    """The compact decoder's output; the paper's is a sigmoid."""
+    width: int = 128
+    """Units per layer of the compact decoder."""
+    batch: int = 8
+    """Garments per step (the paper: 4)."""
+    places: int = 1200
+    """Places per garment and step (the paper: 20000)."""
+    slopes: int = 400
+    """How many of them also have their gradient compared (the paper: all)."""
+    encoded: int = 2
+    """How many garments of a batch go through the encoder."""
+    aim: float = 0.03
+    """Weight of the distance between their codes and the aims."""
+    loss: Literal["bce", "l1", "l2"] = "bce"
+    """Distance loss: binary cross-entropy (Eq. 4), or the alternatives of §7.1."""
+    gradient: float = 0.1
+    """λ_g: weight of the gradient loss (Eq. 5); 0 = without."""
+    rate: float = 2e-3
+    """Adam's learning rate at the start; decays along a cosine (the paper: 1e-4)."""
+    sampling: Sampling = field(default_factory=Sampling)
+    """How places are drawn."""
+    evaluate: int = 10
+    """Held-out garments of each kind to evaluate on; 0 = none."""
+
+
+def train_udf(config: TrainUdf) -> Path:
+    """Train, evaluate on held-out garments and write weights with their card; returns the weights' file.
+
+    Interrupted, the next call with the same settings goes on from the last checkpoint (one a minute).
+
+    Raises:
+        UserError: no such family, or no garments of it.
+    """
+    if config.family not in FAMILIES:
+        raise UserError(f"garment family: found {config.family!r}, wanted one of {', '.join(FAMILIES)}")
+    items = [item for kind in FAMILIES[config.family] for item in _items(config, kind, "train")]
+    if not items:
+        raise UserError(f"{config.data or config.family}: no garments of family {config.family} to train on")
+    decoder, done = learn(items, config)
+    path = store(decoder, config, done, {})  # evaluation takes minutes: what was learned is safe from now on
+    if not config.evaluate:
+        return path
+    from pipelines.eval_udf import evaluate
+
+    tests = [item for kind in FAMILIES[config.family] for item in _items(config, kind, "test")[: config.evaluate]]
+    return store(decoder, config, done, {"unseen": evaluate(decoder, tests)})
+
+
+def _items(config: TrainUdf, kind: str, split: str) -> list[Item]:
+    source = kind if config.data is None else config.data / f"{kind}_{split}.npz"
+    if config.data is not None and not Path(source).is_file():
+        return []
+    items = [item for item in load_items(source, split) if item.garment.kind == kind]
+    return items[: config.garments or None] if split == "train" else items
+
+
+def learn(items: Sequence[Item], config: TrainUdf) -> tuple[UdfDecoder, Training]:
+    """The training itself, for garments in memory."""
+    torch.set_num_threads(config.threads)
+    meshes = [item.garment.mesh for item in items]
+    low, high = bounds(meshes)
+    shape = UdfShape.paper(config.family, low, high) if config.size == "paper" else UdfShape(config.family, low, high)
+    if config.size == "compact":
+        shape = replace(shape, head=config.head, width=config.width)
+    samples = collect(meshes, shape, config.sampling, torch.Generator().manual_seed(config.seed))
+    training = start(shape, config, len(samples))
+    training.resume()
+    nets = training.module
+    assert isinstance(nets, UdfNets)
+    generator = torch.Generator().manual_seed(config.seed + training.step)
+    nets.train()
+    training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(nets, samples, config, generator))
+    nets.eval()
+    known = [Known(i.garment.kind, i.garment.variant, dict(i.parameters)) for i in items]
+    return UdfDecoder(nets, codes_of(nets, samples), known), training
+
+
+def start(shape: UdfShape, config: TrainUdf, count: int) -> Training:
+    """A training that has not begun; ``count``: how many garments it will see."""
+    torch.manual_seed(config.seed)
+    nets = UdfNets(shape)
+    adam = torch.optim.Adam(nets.parameters(), lr=config.rate, betas=(0.9, 0.99))
+    return Training(f"udf-{config.family}", nets, adam, _settings(config, count), config.out)
+
+
+def batch_loss(
+    nets: UdfNets, samples: UdfSamples, config: TrainUdf, generator: torch.Generator
+) -> tuple[Tensor, dict[str, float]]:
+    """Eq. 1 on a random batch, and its terms."""
+    garments = torch.randperm(len(samples), generator=generator)[: config.batch]
+    cloud = torch.randint(samples.clouds.shape[1], (len(garments),), generator=generator)
+    pick = torch.randint(samples.places.shape[1], (len(garments), config.places), generator=generator)
+    row = garments[:, None]
+    x, wanted = samples.places[row, pick], samples.distance[row, pick]
+    slopes = config.slopes if config.gradient else 0
+    direction = samples.direction[row, pick[:, :slopes]].float()
+    with torch.autocast(x.device.type, torch.bfloat16, enabled=config.size == "compact"):
+        some, aims = garments[: config.encoded], samples.aims[garments]
+        own = nets.encoder(
+            samples.clouds[some, cloud[: len(some)]], samples.near[some, cloud[: len(some)]].int()
+        ).float()
+        z = torch.cat([own, aims[len(some) :] + 0.05 * torch.randn(aims[len(some) :].shape, generator=generator)])
+        found, gradient = fields(nets, x, z, slopes)
+    distance = distance_loss(found, wanted, config.loss)
+    terms = {"distance": distance.detach(), "mm": 1e3 * nets.shape.reach * _near_error(found, wanted)}
+    code = (own - aims[: len(own)]).square().mean()
+    loss, terms["code"] = distance + config.aim * code, code.detach()
+    if slopes:
+        known = (direction.square().sum(-1) > 0.5).float()
+        off = ((gradient - direction).square().sum(-1) * known).sum() / known.sum().clamp_min(1)
+        loss, terms["slope"] = loss + config.gradient * off, off.detach()
+    return loss, {k: float(v) for k, v in terms.items()}
+
+
+def fields(nets: UdfNets, x: Tensor, z: Tensor, slopes: int) -> tuple[Tensor, Tensor]:
+    """Distances over δ (B, N) at x (B, N, 3), and the distance's gradients (B, slopes, 3) at the first of them."""
+    if not slopes:
+        return nets.decoder(x, z), x[:, :0]
+    some = x[:, :slopes].clone().requires_grad_()
+    if nets.shape.batch_statistics:  # one batch, whole: its statistics belong to all of it
+        some = x.clone().requires_grad_()
+        found = nets.decoder(some, z)
+        (gradient,) = torch.autograd.grad(found.sum(), some, create_graph=True)
+        return found, nets.shape.clip * gradient[:, :slopes]
+    layers = nets.decoder.fold(z)
+    if nets.decoder.training:
+        nets.decoder.learn_statistics(layers, x[:, ::8])
+    first = nets.decoder.run(layers, some)
+    (gradient,) = torch.autograd.grad(first.sum(), some, create_graph=True)
+    return torch.cat([first, nets.decoder.run(layers, x[:, slopes:])], 1), nets.shape.clip * gradient
+
+
+def distance_loss(found: Tensor, wanted: Tensor, kind: str) -> Tensor:
+    """L_dist of distances over δ, both in [0, 1]: Eq. 4, or §7.1's alternatives."""
+    if kind == "bce":
+        p = found.clamp(1e-4, 1 - 1e-4)
+        own = F.binary_cross_entropy(wanted.clamp(1e-4, 1 - 1e-4), wanted)  # its least value, for a readable curve
+        return F.binary_cross_entropy(p, wanted) - own
+    return (found - wanted).abs().mean() if kind == "l1" else (found - wanted).square().mean()
+
+
+def _near_error(found: Tensor, wanted: Tensor) -> Tensor:
+    near = wanted < 0.3
+    return ((found - wanted).abs() * near).sum().detach() / near.sum().clamp_min(1)
+
+
+@torch.no_grad()
+def codes_of(nets: UdfNets, samples: UdfSamples) -> Tensor:
+    """(G, Z) the codes of all garments, averaged over their clouds."""
+    rows = []
+    for clouds, near in zip(samples.clouds, samples.near, strict=True):
+        rows.append(nets.encoder(clouds, near.int()).mean(0))
+    return torch.stack(rows)
+
+
+def _settings(config: TrainUdf, count: int) -> str:
+    """What a checkpoint must agree with to go on from it."""
+    free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
+    return json.dumps(
+        {**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True
+    )
+
+
+def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[str, object]) -> Path:
+    """Write ``udf-<family>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
+    tensors = {"codes": decoder.all_codes, **decoder.nets.state_dict()}
+    card = {
+        "what": f"unsigned distance fields, {config.family} (DGCNN encoder, CBN decoder, {len(decoder.known)} codes)",
+        "shape": asdict(decoder.nets.shape),
+        "kinds": [k.kind for k in decoder.known],
+        "variants": [k.variant for k in decoder.known],
+        "parameters": [{k: round(v, 4) for k, v in known.parameters.items()} for known in decoder.known],
+        "data": f"{len(decoder.known)} generated garments of kinds {', '.join(FAMILIES[config.family])}",
+        "loss": f"{config.loss}, gradient weight {config.gradient}",
+        "seed": config.seed,
+        "steps": done.step,
+        "minutes": round(done.seconds / 60, 1),
+        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        "licence": "CC0-1.0",
+        "metrics": metrics,
+    }
+    exact = [k for k in tensors if k.endswith(("var", "mean"))]
+    return write_weights(f"udf-{config.family}", tensors, card, config.out, exact=exact)
