@@ -28,10 +28,10 @@ def load_garment(name: str, resolution: int = 96) -> Garment | Mesh:
 
     kind, _, code = name.partition(":")
     if kind not in KINDS or not code:
-        from recon.files.meshes import read_mesh
+        from recon.files.meshes import read_garment
 
         if Path(name).suffix or Path(name).exists():
-            return read_mesh(name)
+            return read_garment(name)
         raise UserError(f"garment: found {name!r}; wanted {FORMS} (KIND: {', '.join(KINDS)})")
     split, _, number = code.partition(":")
     if split in ("train", "test"):

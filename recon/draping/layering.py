@@ -82,7 +82,8 @@ class Beneath:
     def closest(self, x: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """For points (N, 3) and their own normals: closest points and normals there (N, 3), whether they count (N,).
 
-        Beside an open border there are no sides, far away is not beneath, and what faces another way is another part.
+        Beside an open border there are no sides, far away is not beneath, and what faces another way is another part; but
+        a closed surface, the body, has an inside for all.
         """
         face, weights, _ = self.contact.closest(x.detach())
         corners = self.contact.faces[face]
@@ -90,7 +91,8 @@ class Beneath:
         normal = F.normalize((self.normals[corners] * weights[..., None]).sum(1), dim=-1)
         counts = ~(self.rim[corners] | (weights < ON_RIM)).all(1)
         counts &= (x.detach() - on).norm(dim=1) < REACH
-        counts &= (normals.detach() * normal).sum(1) > SAME_WAY
+        if self.rim.any():
+            counts &= (normals.detach() * normal).sum(1) > SAME_WAY
         return on, normal, counts
 
     def lack(self, x: Tensor, normals: Tensor, margin: float = MARGIN) -> tuple[Tensor, Tensor]:

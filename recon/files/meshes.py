@@ -15,6 +15,8 @@ from recon.types import Garment, Mesh, UserError
 
 Colour = tuple[float, float, float]
 
+_KIND = "# garment"
+"""Begins the comment by which a garment's OBJ file says its kind."""
 _READABLE = ("obj", "ply", "stl", "off", "glb", "gltf")
 
 
@@ -46,6 +48,8 @@ def write_obj(thing: Mesh | Garment, path: str | Path, name: str = "") -> None:
     mesh = thing.mesh if isinstance(thing, Garment) else thing
     vertices = finite_vertices(mesh, name)
     lines = [f"# {name}: metres, y up" + (", vt = panel coordinates in metres" if isinstance(thing, Garment) else "")]
+    if isinstance(thing, Garment):
+        lines.append(f"{_KIND} {thing.kind}")
     lines.append(f"o {name}")
     lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
     corners = (mesh.faces.cpu() + 1).tolist()
@@ -192,6 +196,55 @@ def _read_obj(path: Path) -> tuple[Tensor, Tensor]:
             faces += [(at[0], at[i], at[i + 1]) for i in range(1, len(at) - 1)]
     return torch.tensor(vertices, dtype=torch.float32).reshape(-1, 3), torch.tensor(faces, dtype=torch.long).reshape(
         -1, 3
+    )
+
+
+def read_garment(path: str | Path) -> Garment | Mesh:
+    """Read a garment with its panels from an OBJ file that ``write_obj`` wrote; a plain mesh from any other.
+
+    Seams have lost their names: border labels are 0 at open edges and 1 ("seam") at seams.
+    UserError: as :func:`read_mesh`, or corners without panel coordinates.
+    """
+    path = Path(path)
+    mesh = read_mesh(path)
+    lines = path.read_text(errors="replace").splitlines() if path.suffix.lower() == ".obj" else []
+    kind = next((line.removeprefix(_KIND).strip() for line in lines if line.startswith(_KIND)), "")
+    if not kind:
+        return mesh
+    flat = [[float(n) for n in line.split()[1:3]] for line in lines if line.startswith("vt ")]
+    corners = [[c.split("/") for c in line.split()[1:]] for line in lines if line.startswith("f ")]
+    try:
+        points = torch.tensor(flat, dtype=torch.float32).reshape(-1, 2)
+        panel_faces = torch.tensor([[int(c[1]) - 1 for c in face] for face in corners]).reshape(-1, 3)
+        sound = bool(points.isfinite().all()) and 0 <= int(panel_faces.min()) and int(panel_faces.max()) < len(points)
+    except (ValueError, IndexError, RuntimeError):
+        sound = False
+    if not sound or len(panel_faces) != len(mesh.faces):
+        raise UserError(f"{path}: a garment's file without sound panel coordinates; wanted three v/vt corners a face")
+    return _with_panels(kind, mesh, points, panel_faces)
+
+
+def _with_panels(kind: str, mesh: Mesh, points: Tensor, panel_faces: Tensor) -> Garment:
+    """The garment of a mesh and its panels (P, 2); triangles that turn the other way are the back panel's."""
+    a, b, c = points[panel_faces].unbind(1)
+    u, v = b - a, c - a
+    vertex_of_point = torch.zeros(len(points), dtype=torch.long)
+    vertex_of_point[panel_faces.flatten()] = mesh.faces.flatten()
+    edges = torch.cat([panel_faces[:, [0, 1]], panel_faces[:, [1, 2]], panel_faces[:, [2, 0]]]).sort(1).values
+    unique, count = edges.unique(dim=0, return_counts=True)
+    labels = torch.full((len(points),), -1)
+    labels[unique[count == 1].flatten()] = 0
+    sewn = torch.bincount(vertex_of_point, minlength=len(mesh.vertices))[vertex_of_point] > 1
+    labels[(labels == 0) & sewn] = 1
+    return Garment(
+        kind=kind,
+        mesh=mesh,
+        panel_points=points,
+        panel_faces=panel_faces,
+        panel_of_face=(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0] < 0).long(),
+        vertex_of_point=vertex_of_point,
+        border_labels=labels,
+        seam_names=("open", "seam"),
     )
 
 

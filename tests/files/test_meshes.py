@@ -11,8 +11,8 @@ import pytest
 import torch
 import trimesh
 
-from recon.files.meshes import read_mesh, write_glb, write_obj
-from recon.types import Mesh, UserError
+from recon.files.meshes import read_garment, read_mesh, write_glb, write_obj
+from recon.types import Garment, Mesh, UserError
 
 
 @pytest.fixture
@@ -33,6 +33,25 @@ def test_a_garment_keeps_its_weld_and_carries_its_pattern(tmp_path, flat_shirt):
     assert torch.allclose(points, shirt.panel_points, atol=1e-6)
     corners = [[c.split("/") for c in line.split()[1:]] for line in lines if line.startswith("f ")]
     assert torch.equal(torch.tensor([[int(c[1]) - 1 for c in face] for face in corners]), shirt.panel_faces)
+
+
+def test_a_garment_comes_back_with_its_panels(tmp_path, flat_shirt, ball):
+    shirt = flat_shirt()
+    write_obj(shirt, tmp_path / "top.obj")
+    back = read_garment(tmp_path / "top.obj")
+    assert isinstance(back, Garment) and back.kind == "top" and back.seam_names == ("open", "seam")
+    torch.testing.assert_close(back.panel_points, shirt.panel_points, atol=1e-6, rtol=0)
+    for name in ("panel_faces", "panel_of_face", "vertex_of_point"):
+        assert torch.equal(getattr(back, name), getattr(shirt, name)), name
+    inside = shirt.border_labels < 0
+    assert torch.equal(back.border_labels < 0, inside)
+    assert torch.equal(back.border_labels[~inside] == 0, shirt.border_labels[~inside] == 0)
+    write_obj(ball, tmp_path / "ball.obj")
+    assert isinstance(read_garment(tmp_path / "ball.obj"), Mesh)
+    text = (tmp_path / "top.obj").read_text()
+    (tmp_path / "cut.obj").write_text("\n".join(line for line in text.splitlines() if not line.startswith("vt ")))
+    with pytest.raises(UserError, match="panel coordinates"):
+        read_garment(tmp_path / "cut.obj")
 
 
 def test_others_read_our_obj(tmp_path, ball, flat_shirt):
