@@ -28,6 +28,8 @@ class Command:
     """Calls (run, settings), shows progress and result and returns the exit code; None = print what comes back."""
     words: str = ""
     """The setting that words before the first option fill."""
+    repeats: bool = False
+    """Whether a garment named twice is meant twice."""
 
 
 OK, WRONG, INTERRUPTED = 0, 2, 130
@@ -112,7 +114,7 @@ COMMANDS = {
         "drape garments over a motion", "pipelines.sequence", "Animate", "animate", _show_animation, "garments"
     ),
     "decode": Command("write the garment of a code", "pipelines.decode", "Decode", "decode", _show_figures, "what"),
-    "drape": Command("dress a body in garments", "pipelines.drape", "Drape", "drape", _show_drape, "garments"),
+    "drape": Command("dress a body in garments", "pipelines.drape", "Drape", "drape", _show_drape, "garments", True),
     "edit": Command("change a garment through its pattern", "pipelines.edit", "Edit", "edit", _show_figures, "what"),
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
@@ -193,7 +195,7 @@ def _dispatch(name: str, args: list[str]) -> int:
         import tyro
 
         settings = getattr(module, command.config)
-        config = (_split(tyro.cli(settings, prog=f"recon {name}", args=_named(args, command.words))),)
+        config = (_split(tyro.cli(settings, prog=f"recon {name}", args=_named(args, command.words)), command.repeats),)
     elif args:
         return _wrong(f"{' '.join(args)}: recon {name} takes nothing")
     if command.show:
@@ -212,11 +214,12 @@ def _named(args: list[str], setting: str) -> list[str]:
     return [f"--{setting}", *args] if setting and count else args
 
 
-def _split(config: Any) -> Any:
+def _split(config: Any, repeats: bool) -> Any:
     """Settings in which names may have been given as ``top,trousers``, as separate words or both."""
     if isinstance(getattr(config, "garments", None), tuple):
         names = [word.strip() for given in config.garments for word in given.split(",")]
-        config = replace(config, garments=tuple(dict.fromkeys(name for name in names if name)))
+        names = [name for name in names if name]
+        config = replace(config, garments=tuple(names if repeats else dict.fromkeys(names)))
     return config
 
 

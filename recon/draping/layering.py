@@ -82,8 +82,8 @@ class Beneath:
     def closest(self, x: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """For points (N, 3) and their own normals: closest points and normals there (N, 3), whether they count (N,).
 
-        Beside an open border there are no sides, far away is not beneath, and what faces another way is another part; but
-        a closed surface, the body, has an inside for all.
+        Beside an open border there are no sides, far away is not beneath, and what faces another way is another part.
+        But a closed surface, the body, has an inside for all.
         """
         face, weights, _ = self.contact.closest(x.detach())
         corners = self.contact.faces[face]

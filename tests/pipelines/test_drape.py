@@ -71,6 +71,13 @@ def test_wrong_poses_are_told(pose: str, body) -> None:
         load_pose(pose, body)
 
 
+def test_the_same_garment_may_be_worn_twice(tmp_path: Path) -> None:
+    out = ["--out", str(tmp_path / "o"), "--resolution", "24", "--draper", "skinning", "--no-untangle", "--no-layering"]
+    assert main(["drape", "skirt:3,skirt:3", *out]) == 0
+    figures = json.loads((tmp_path / "o" / "result.json").read_text())["garments"]
+    assert list(figures) == ["skirt-3", "skirt-3_2"] and "skirt-3" in figures["skirt-3_2"]["beneath_pct"]
+
+
 def test_mistakes_end_with_one_line(tmp_path: Path, capsys) -> None:
     (tmp_path / "note.txt").write_text("mine")
     cases = [
