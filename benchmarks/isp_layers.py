@@ -250,7 +250,7 @@ def measure(quick: bool, folder: Path | None = None, say=lambda line: None, outf
         outfits: so many of each table instead of the usual number; 0 = the usual.
     """
     size = QUICK if quick else FULL
-    size = replace(size, groups=outfits or size.groups)
+    size = replace(size, groups=outfits, tangled=min(size.tangled, outfits // 4)) if outfits else size
     body = load_body()
     draper, layering = load_isp_draper(body, folder), load_layering(folder)
     figures: dict = {"tables": {}, "pose_source": "held-out clip and random" if CLIP.is_file() else "random"}

@@ -23,7 +23,7 @@ from recon.cloth.frames import FrameWeights
 from recon.draping.isp import DisplacementNet, DisplacementShape, Worn, load_isp_draper
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, rest_features
-from recon.files.weights import write_weights
+from recon.files.weights import read_manifest, write_weights
 from recon.garments import KINDS
 from recon.types import UserError
 
@@ -195,4 +195,7 @@ def store(net: DisplacementNet, config: TrainDrapeIsp, done: Training) -> Path:
         "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
         "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
     }
+    if config.start is not None:
+        earlier = read_manifest(config.start).get(f"drape-isp-{config.kind}", {})
+        card["before"] = {key: earlier.get(key) for key in ("steps", "minutes", "settings")}
     return write_weights(f"drape-isp-{config.kind}", dict(net.state_dict()), card, config.out)

@@ -25,10 +25,15 @@ from recon.types import Garment, Mesh, UserError
 
 MARGIN = 0.004
 """epsilon of Eq. 10: distance that an outer layer keeps from the one beneath [m]."""
-REACH = 0.05
+REACH = 0.08
 """Layers deeper in each other than this are not recognised [m]."""
-SAME_WAY = 0.2
-"""A vertex belongs over a face only if their normals agree by this cosine: a sleeve beside the hip covers nothing."""
+SKIN_REACH = 0.02
+"""The same for a closed surface, the body: deeper between arm and trunk the nearest way out tears the cloth [m]."""
+SAME_WAY = (0.2, 0.7)
+"""A vertex belongs over a face only if their normals agree by this cosine, near it and far from it: a sleeve beside the
+hip covers nothing, and the hem that hangs between the legs does not lie on the other thigh."""
+DEEP = (0.02, 0.06)
+"""What near and far mean there [m]."""
 ON_RIM = 1e-3
 """Barycentric weight below which a corner has no part in a closest point."""
 CELL = 0.016
@@ -83,16 +88,16 @@ class Beneath:
         """For points (N, 3) and their own normals: closest points and normals there (N, 3), whether they count (N,).
 
         Beside an open border there are no sides, far away is not beneath, and what faces another way is another part.
-        But a closed surface, the body, has an inside for all.
         """
         face, weights, _ = self.contact.closest(x.detach())
         corners = self.contact.faces[face]
         on = (self.contact.vertices[corners] * weights[..., None]).sum(1)
         normal = F.normalize((self.normals[corners] * weights[..., None]).sum(1), dim=-1)
         counts = ~(self.rim[corners] | (weights < ON_RIM)).all(1)
-        counts &= (x.detach() - on).norm(dim=1) < REACH
-        if self.rim.any():
-            counts &= (normals.detach() * normal).sum(1) > SAME_WAY
+        far = (x.detach() - on).norm(dim=1)
+        counts &= far < (REACH if self.rim.any() else SKIN_REACH)
+        share = ((far - DEEP[0]) / (DEEP[1] - DEEP[0])).clamp(0, 1)
+        counts &= (normals.detach() * normal).sum(1) > SAME_WAY[0] + share * (SAME_WAY[1] - SAME_WAY[0])
         return on, normal, counts
 
     def lack(self, x: Tensor, normals: Tensor, margin: float = MARGIN) -> tuple[Tensor, Tensor]:
