@@ -25,13 +25,14 @@ import torch
 from pipelines.sequence import led_in, measure, untangled
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import motion_of
+from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
 from recon.cloth.rest import Resting, rest
 from recon.draping.gaps import GapsNet, GapsShape, load_gaps, motion_features
 from recon.files.animations import Moving
 from recon.files.motions import read_clip
 from recon.files.weights import read_manifest
-from recon.types import BodyPose, Garment, Mesh, Motion
+from recon.types import BodyPose, Mesh, Motion
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARED = Path(os.environ.get("GARMENT_RECON_SHARED", ROOT.parent / "shared"))
@@ -61,6 +62,7 @@ def table1(
     }
     if draw_apart:
         done, how = untangled([part], posed, body)
+        how.pop("notes")
         row["untangled"] = measure(Moving(draper.garment, done[0]), posed, body) | how | {"frames": len(x)}
     return row
 
@@ -109,16 +111,10 @@ def hanging_square(cells: int, tolerance: float = 0.02) -> dict[str, float]:
 
     axis = np.arange(cells + 1) / cells
     grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
-    c = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    n = cells + 1
-    faces = torch.as_tensor(np.concatenate([np.stack([c, c + n, c + n + 1], 1), np.stack([c, c + n + 1, c + 1], 1)]))
     x = np.column_stack([grid, 0.01 * np.sin(7 * grid[:, 0]) * (1 - grid[:, 1])])
     pins = np.flatnonzero((grid[:, 1] == 1) & ((grid[:, 0] == 0) | (grid[:, 0] == 1)))
     x[pins, 0] += np.where(x[pins, 0] < 0.5, 0.1, -0.1)
-    flat = Mesh(torch.as_tensor(np.column_stack([grid, np.zeros(len(grid))])), faces)
-    points, which = torch.as_tensor(grid), torch.arange(len(grid))
-    labels, panels = torch.full((len(grid),), -1), torch.zeros(len(faces)).long()
-    cloth = Cloth.from_garment(Garment("top", flat, points, faces, panels, which, labels))
+    cloth = Cloth.from_mesh(square_mesh(grid, cells))
     begin = time.perf_counter()
     found = rest(cloth, x, pins, settings=Resting(tolerance=tolerance))
     return {
@@ -135,6 +131,42 @@ def hanging_square(cells: int, tolerance: float = 0.02) -> dict[str, float]:
 def solver_error(found: dict, reference: dict) -> float:
     """Percent by which the sag (lowest point under the pins) differs from a finer solution."""
     return round(100 * abs(found["lowest"] - reference["lowest"]) / abs(1 - reference["lowest"]), 3)
+
+
+def draped_ball(cells: int) -> dict[str, float]:
+    """A square of 60 cm dropped over a ball of 20 cm radius: where it hangs on average."""
+    import trimesh
+
+    axis = np.arange(cells + 1) / cells
+    grid = 0.6 * np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    flat = square_mesh(grid, cells)
+    x = np.column_stack([grid[:, 0] - 0.3, np.full(len(grid), 0.206), grid[:, 1] - 0.3])
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.2)
+    body = BodyContact(torch.as_tensor(np.array(ball.vertices)), torch.as_tensor(np.array(ball.faces)))
+    begin = time.perf_counter()
+    found = rest(Cloth.from_mesh(flat), x, body=body, settings=Resting(tolerance=0.05))
+    mass = Cloth.from_mesh(flat).masses.numpy()
+    return {
+        "vertices": len(x),
+        "seconds": round(time.perf_counter() - begin, 2),
+        "height": float((found.x[:, 1] * mass).sum() / mass.sum()),
+        "residual": round(found.residual, 4),
+        "converged": found.converged,
+        "energy_fell": all(b <= a + 1e-12 for a, b in zip(found.energies, found.energies[1:])),
+    }
+
+
+def ball_error(found: dict, reference: dict) -> float:
+    """Percent by which the mean drop beneath the ball's top differs from a finer solution."""
+    return round(100 * abs(found["height"] - reference["height"]) / abs(0.2 - reference["height"]), 3)
+
+
+def square_mesh(grid: np.ndarray, cells: int) -> Mesh:
+    """A flat mesh of grid points (N, 2)."""
+    n = cells + 1
+    c = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
+    faces = np.concatenate([np.stack([c, c + n, c + n + 1], 1), np.stack([c, c + n + 1, c + 1], 1)])
+    return Mesh(torch.as_tensor(np.column_stack([grid, np.zeros(len(grid))])), torch.as_tensor(faces))
 
 
 def gaps_names(folder: Path | None, wanted: list[str] | None) -> list[str]:
@@ -162,69 +194,92 @@ def quick(folder: Path | None) -> dict:
     return row
 
 
-def full(folder: Path | None, names: list[str], cases: int, every: int) -> dict:
-    """Everything."""
-    from tangles import run_tangles
-
-    body = load_body()
-    motion = motion_of(read_clip(CLIP), body, 30.0)
-    found: dict = {"table1": {}, "table3": {}, "cards": {}}
-    cards = read_manifest(folder)
+def networks(folder: Path | None, names: list[str], body: Body, motion: Motion, every: int) -> dict:
+    """Table 1, and what each network is."""
+    cards, found = read_manifest(folder), {}
     for name in names:
-        found["table1"][name] = table1(name, folder, body, motion, 3, draw_apart=False)
-        found["table1"][name]["untangled"] = table1(name, folder, body, motion, every)["untangled"]
-        found["cards"][name] = {k: cards[f"gaps-{name}"][k] for k in ("steps", "minutes", "skinning")}
-        print(name, found["table1"][name]["network"], flush=True)
+        found[name] = table1(name, folder, body, motion, 3, draw_apart=False)
+        if every:
+            found[name]["untangled"] = table1(name, folder, body, motion, every)["untangled"]
+        found[name]["card"] = {k: cards[f"gaps-{name}"][k] for k in ("steps", "minutes", "skinning")}
+        print(name, found[name]["network"], flush=True)
+    return found
+
+
+def other_bodies(folder: Path | None, names: list[str], body: Body, motion: Motion) -> dict:
+    """Table 3."""
+    found: dict = {}
     for title, known in BODIES.items():
-        for name in names:
-            shape = body.shape_from(**known) if known else None
-            found["table3"].setdefault(title, {})[name] = table1(
-                name, folder, body, motion, 10, shape, draw_apart=False
-            )["network"]
-    found["table4_ms"] = time_per_frame(body)
-    print(found["table4_ms"], flush=True)
+        shape = body.shape_from(**known) if known else None
+        rows = {name: table1(name, folder, body, motion, 10, shape, draw_apart=False)["network"] for name in names}
+        found[title] = rows
+        print(title, rows, flush=True)
+    return found
+
+
+def solver() -> dict:
+    """Hanging squares of three meshes against the finest, draped balls likewise."""
     squares = {n: hanging_square(n) for n in (35, 70)}
     reference = hanging_square(100, 0.01)
-    found["solver"] = {
-        "squares": squares,
-        "reference": reference,
-        "error_pct": solver_error(squares[70], reference),
-    }
-    print(found["solver"], flush=True)
-    rows = []
-    for row in run_tangles(cases):
-        rows.append(row)
-        print(row, flush=True)
-    clean = [r for r in rows if not r["pairs_left"] and not r["inside"]]
-    found["tangles"] = {
-        "cases": len(rows),
-        "clean": len(clean),
-        "seconds_per_pair_median": statistics.median(r["seconds_per_pair"] for r in rows),
-        "seconds_per_pair_max": max(r["seconds_per_pair"] for r in rows),
-        "moved_mean_mm_median": statistics.median(r["moved_mean_mm"] for r in rows),
-        "rows": rows,
-    }
+    balls = [draped_ball(n) for n in (24, 36, 54)]
+    found = {"squares": squares, "reference": reference, "error_pct": solver_error(squares[70], reference)}
+    found |= {"balls": balls, "ball_error_pct": ball_error(balls[-2], balls[-1])}
+    print(found, flush=True)
     return found
+
+
+def tangles(cases: int) -> dict:
+    """Untangling, by family of tangles."""
+    from tangles import FAMILIES, run_tangles
+
+    found = {}
+    for family in FAMILIES:
+        rows = []
+        for row in run_tangles(cases, family=family):
+            rows.append(row)
+            print(row, flush=True)
+        clean = [r for r in rows if not r["pairs_left"] and not r["inside"]]
+        found[family] = {
+            "cases": len(rows),
+            "clean": len(clean),
+            "seconds_per_pair_median": statistics.median(r["seconds_per_pair"] for r in rows),
+            "seconds_per_pair_max": max(r["seconds_per_pair"] for r in rows),
+            "moved_mean_mm_median": statistics.median(r["moved_mean_mm"] for r in rows),
+            "rows": rows,
+        }
+    return found
+
+
+def table(title: str, rows: dict[str, dict], untangled: bool) -> list[str]:
+    """Networks over the clip, as lines."""
+    after = " after untangling: eps_e, eps_c, clean frames |" if untangled else ""
+    lines = [
+        "",
+        f"## {title}",
+        "",
+        f"| network | steps | eps_e % | eps_a % | eps_c % |{after} skinning alone: e, a, c |",
+    ]
+    lines += ["|---|---|---|---|---|---|" + "---|" * untangled]
+    for name, row in rows.items():
+        n, s = row["network"], row["skinning"]
+        line = f"| {name} | {row['card']['steps']} | {n['eps_e']:.2f} | {n['eps_a']:.2f} "
+        line += f"| {n['eps_c']:.2f} ± {n['eps_c_std']:.2f} |"
+        if untangled:
+            u = row["untangled"]
+            line += f" {u['eps_e']:.2f}, {u['eps_c']:.2f}, {u['clean_frames']} of {u['frames']} |"
+        lines.append(f"{line} {s['eps_e']:.2f}, {s['eps_a']:.2f}, {s['eps_c']:.2f} |")
+    return lines
 
 
 def page(found: dict) -> str:
     """docs/results/gaps.md."""
-    lines = ["# GAPS, solver and untangling, measured", ""]
     about = f"`python benchmarks/gaps.py` on {found['machine']}, {found['cores']} cores, {found['date']}."
-    lines += [f"{about} Clip: {CLIP.stem}, which no network learned from.", "", "## Table 1: the neutral body", ""]
-    lines += [
-        "| network | steps | eps_e % | eps_a % | eps_c % | after untangling: eps_e, eps_c, clean frames "
-        "| skinning alone: eps_e, eps_a, eps_c |"
-    ]
-    lines += ["|---|---|---|---|---|---|---|"]
-    for name, row in found["table1"].items():
-        n, u, s = row["network"], row["untangled"], row["skinning"]
-        lines.append(
-            f"| {name} | {found['cards'][name]['steps']} | {n['eps_e']:.2f} | {n['eps_a']:.2f} "
-            f"| {n['eps_c']:.2f} ± {n['eps_c_std']:.2f} "
-            f"| {u['eps_e']:.2f}, {u['eps_c']:.2f}, {u['clean_frames']} of {u['frames']} "
-            f"| {s['eps_e']:.2f}, {s['eps_a']:.2f}, {s['eps_c']:.2f} |"
-        )
+    lines = ["# GAPS, solver and untangling, measured", ""]
+    lines += [f"{about} Clip: {CLIP.stem}, which no network learned from."]
+    lines += table("Table 1: the neutral body", found["table1"], True)
+    if "baselines" in found:
+        lines += table("Baselines in the same frame, as many steps each", found["baselines"], False)
+        lines += ["", "snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility."]
     lines += [
         "",
         "## Table 3: other bodies",
@@ -235,7 +290,7 @@ def page(found: dict) -> str:
     for title, rows in found["table3"].items():
         for name, n in rows.items():
             lines.append(f"| {title} | {name} | {n['eps_e']:.2f} | {n['eps_a']:.2f} | {n['eps_c']:.2f} |")
-    t, s, u = found["table4_ms"], found["solver"], found["tangles"]
+    t, s = found["table4_ms"], found["solver"]
     lines += ["", "## Table 4: time", ""]
     lines += [
         f"{t['one_by_one']} ms a frame one by one, {t['at_once']} ms all at once (5000 vertices, body posed too)."
@@ -250,12 +305,45 @@ def page(found: dict) -> str:
     for r in (*s["squares"].values(), s["reference"]):
         lines.append(f"| {r['vertices']} | {r['seconds']} | {r['lowest']:.4f} | {r['residual']} | {r['energy_fell']} |")
     lines += ["", f"The sag of the 5041-vertex square differs by {s['error_pct']} % from the finest.", ""]
+    if "balls" in s:
+        lines += [
+            "| draped ball, vertices | seconds | mean height m | residual | energy only fell |",
+            "|---|---|---|---|---|",
+        ]
+        for r in s["balls"]:
+            lines.append(
+                f"| {r['vertices']} | {r['seconds']} | {r['height']:.4f} | {r['residual']} | {r['energy_fell']} |"
+            )
+        lines += ["", f"The mean drop of the second differs by {s['ball_error_pct']} % from the finest.", ""]
     lines += ["## Untangling", ""]
-    lines += [
-        f"{u['clean']} of {u['cases']} random tangles end clean; {u['seconds_per_pair_median']} s per pair of layers "
-        f"in the median, {u['seconds_per_pair_max']} s at most; they move {u['moved_mean_mm_median']} mm on average."
-    ]
+    for family, u in found["tangles"].items():
+        lines += [
+            f"- {family}: {u['clean']} of {u['cases']} random tangles end clean; {u['seconds_per_pair_median']} s per "
+            f"pair of layers in the median, {u['seconds_per_pair_max']} s at most; they move "
+            f"{u['moved_mean_mm_median']} mm on average."
+        ]
     return "\n".join(lines) + "\n"
+
+
+PARTS = ("table1", "baselines", "table3", "table4_ms", "solver", "tangles")
+
+
+def measure_part(part: str, options: argparse.Namespace) -> dict | None:
+    """One part of the page; None where there is nothing to measure."""
+    if part in ("solver", "tangles"):
+        return solver() if part == "solver" else tangles(options.cases)
+    body = load_body()
+    if part == "table4_ms":
+        return time_per_frame(body)
+    if part == "baselines":
+        if options.baselines is None:
+            return None
+        motion = motion_of(read_clip(CLIP), body, 30.0)
+        return networks(options.baselines, gaps_names(options.baselines, None), body, motion, 0)
+    names, motion = gaps_names(options.weights, options.names), motion_of(read_clip(CLIP), body, 30.0)
+    if part == "table3":
+        return other_bodies(options.weights, names, body, motion)
+    return networks(options.weights, names, body, motion, options.every)
 
 
 def main() -> None:
@@ -264,21 +352,24 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--weights", type=Path, default=None)
     parser.add_argument("--names", nargs="*", default=None)
-    parser.add_argument("--cases", type=int, default=100, help="random tangles")
+    parser.add_argument("--baselines", type=Path, default=None, help="folder of NAME-ours, -snug and -ncs")
+    parser.add_argument("--cases", type=int, default=100, help="random tangles of each family")
     parser.add_argument("--every", type=int, default=5, help="frames between two that are untangled")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=PARTS, help="parts to measure anew")
     options = parser.parse_args()
     if options.quick:
         print(json.dumps(quick(options.weights)))
         return
-    found = {
-        "machine": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "date": time.strftime("%Y-%m-%d"),
-        "torch": torch.__version__,
-        **full(options.weights, gaps_names(options.weights, options.names), options.cases, options.every),
-    }
     out = ROOT / "docs" / "results"
-    (out / "gaps.json").write_text(json.dumps(found, indent=1) + "\n")
+    kept = out / "gaps.json"
+    found = json.loads(kept.read_text()) if kept.exists() else {}
+    found |= {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    found |= {"date": time.strftime("%Y-%m-%d"), "torch": torch.__version__}
+    for part in options.only:
+        measured = measure_part(part, options)
+        if measured is not None:
+            found[part] = measured
+        kept.write_text(json.dumps(found, indent=1) + "\n")
     (out / "gaps.md").write_text(page(found))
 
 
