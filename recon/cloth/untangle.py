@@ -2,11 +2,12 @@
 
 Rounds of small moves until an exact test finds nothing:
 
-- vertices and face centres inside the body go out along the way to its surface;
+- vertices and face centres inside the body go out of it (``escape``);
 - between layers the order is known: a vertex of the outer one on the wrong side of the inner one's faces goes back to
   its own side, and what is left of crossing edges is drawn apart along the inner layer's outward direction;
 - within a layer nobody knows which side is right: crossing edges and faces move so that the curve along which the cloth
   passes through itself grows shorter (Volino & Magnenat-Thalmann 2006);
+- where that does not help, pockets and crumples are laid flat (``patches``);
 - edges are brought back to the lengths they came with, so that repairs spread instead of stretching the cloth.
 
 Only what is tangled, and what hangs on it, moves.
@@ -18,11 +19,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 
 from recon.cloth.contact import BodyContact
+from recon.cloth.escape import Escape, scatter
 from recon.cloth.intersections import Crossings
 from recon.cloth.patches import Pockets, laid_across
 from recon.cloth.xpbd import keep_lengths
@@ -32,22 +33,14 @@ WORSE = 2.0
 """So many times as many crossings as at best mean that steps are too long."""
 PATIENCE = 10
 """So many rounds without much progress, then pockets are laid across their curves."""
-ASTRAY = -0.2
-"""Cosine between cloth's outside and the body's nearest way out below which that way is the wrong one."""
+GRACE = 5
+"""So many rounds after that things may look worse: laid cloth has to find its place."""
 FARTHEST = 0.1
 """Where little else helps layers are recognised this deep in each other [m]."""
 OWN_RINGS = 2
 """So many times only a layer's crossings with itself are laid flat, then all."""
 MOST_RINGS = 6
 """Widest surroundings of crossings that are laid flat, in rings of edges."""
-BEHIND = 20
-"""So far behind cloth the body is searched for beginning anew [cm]."""
-PAD = 2e-3
-"""How wrong remembered distances may be: beside sharp creases signs are not sure [m]."""
-STRIDE = 0.01
-"""Longest move through the body towards the right side of it [m]."""
-SMOOTHING = 8
-"""Times that normals are averaged with their neighbours'."""
 CALMEST = 0.1
 """Where steps had to be made shorter than this share, there is no way out."""
 
@@ -126,14 +119,9 @@ class _Tangle:
         self.scale = float(self.lengths.mean())
         self.rims = self._rims()
         self.pockets = Pockets(self.crossings, self.x, self.layer)
-        self.outward = self._outward()
-        self.body = None
-        self.asked: NDArray | None = None
         self.rings = 0
         self.temper = 1.0  # factor on the steps against the curve
-        self.known = np.zeros(0)
-        if body is not None:
-            self.body = BodyContact(body.vertices.detach().cpu().double(), body.faces.cpu())
+        self.body = Escape(body, self.x, self.faces, self.edges) if body is not None else None
 
     def _rims(self) -> NDArray:
         """(V,) whether a vertex lies on an open border."""
@@ -141,20 +129,6 @@ class _Tangle:
         rim = np.zeros(len(self.x), bool)
         rim[open_edges] = True
         return rim
-
-    def _outward(self) -> NDArray:
-        """(V + F, 3) where outside is for the cloth as it came, at vertices and face centres, smoothed over folds."""
-        a, b, c = (self.x[self.faces[:, k]] for k in range(3))
-        count = len(self.x)
-        normal = np.zeros_like(self.x)
-        np.add.at(normal, self.faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, 0))
-        i, j = np.concatenate([self.edges, self.edges[:, ::-1]]).T
-        around = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(count, count)).tocsr()
-        for _ in range(SMOOTHING):
-            normal += around @ normal
-            normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
-        middle = normal[self.faces].mean(1)
-        return np.concatenate([normal, middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-15)])
 
     def solve(self) -> Untangled:
         """Rounds until nothing is left; where it grows worse, back to the best so far with smaller steps."""
@@ -174,7 +148,7 @@ class _Tangle:
             if now < best:
                 stuck = stuck if now[1] > 0.8 * best[1] else 0
                 best, best_x, self.temper = now, self.x.copy(), min(1.0, 1.15 * self.temper)
-            elif len(found) > WORSE * best[1] + 50:
+            elif stuck > GRACE and len(found) > WORSE * best[1] + 50:
                 self.x, self.temper = best_x.copy(), self.temper * 0.7
                 found = self.crossings(self.x)
         if best_x is not self.x:
@@ -233,79 +207,17 @@ class _Tangle:
 
     def _lack(self) -> NDArray:
         """(V + F,) whether vertices and face centres are inside the body."""
-        lack = np.zeros(len(self.x) + len(self.faces), bool)
-        if self.body is not None:
-            near, distance, _ = self._close_to_body(0.0)
-            lack[near[distance < 0]] = True
-        return lack
-
-    def _close_to_body(self, wanted: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Of vertices and face centres, those that may be closer to the body than ``wanted`` [m].
-
-        Their rows (K,), signed distances (K,) and the directions away from the body (K, 3). A point that was far away
-        when it was last asked, and has not moved as far since, is not asked again.
-        """
-        assert self.body is not None
-        points = np.concatenate([self.x, self.x[self.faces].mean(1)])
-        if self.asked is None:
-            near = np.arange(len(points))
-            self.asked, self.known = points.copy(), np.zeros(len(points))
-        else:
-            near = np.flatnonzero(self.known - np.linalg.norm(points - self.asked, axis=1) < wanted + PAD)
-        at = torch.from_numpy(points[near]).requires_grad_()
-        distance = self.body.signed_distance(at)
-        (normal,) = torch.autograd.grad(distance.sum(), at)
-        found = distance.detach().numpy()
-        self.asked[near], self.known[near] = points[near], found
-        return near, found, normal.numpy()
+        return self.body.lack(self.x) if self.body else np.zeros(len(self.x) + len(self.faces), bool)
 
     def _leave_body(self, number: int, times: int = 3) -> NDArray:
         """Vertices and face centres closer to the body than the margin go out; returns which vertices moved."""
-        moved = np.zeros(len(self.x), bool)
         if self.body is None:
-            return moved
-        n, late = len(self.x), max(0.0, 2 * number / self.settings.rounds - 1)
-        wanted = self.settings.body * (1 - 0.9 * late)
-        for _ in range(times):
-            near, distance, normal = self._close_to_body(wanted)
-            lack = np.maximum(wanted - distance, 0) * (1.05 + 3 * late)
-            if not lack.any():
-                break
-            astray = self._astray(near, distance, normal)[:, None]
-            move = np.where(astray, np.minimum(lack, STRIDE)[:, None] * self.outward[near], lack[:, None] * normal)
-            own = (near < n) & (lack > 0)
-            self.x[near[own]] += move[own]
-            by_face = (near >= n) & (lack > 0)
-            corners = self.faces[near[by_face] - n].ravel()
-            self._scatter(corners, np.repeat(move[by_face], 3, 0))
-            moved[near[own]] = True
-            moved[corners] = True
-        return moved
-
-    def _astray(self, near: NDArray, distance: NDArray, normal: NDArray) -> NDArray:
-        """(K,) points whose nearest way out of the body leads to the wrong side: of a sleeve, the arm's other side.
-
-        They leave to where the cloth's own outside is. Not so where behind the way out the body begins anew: that is
-        cloth of the trunk in an arm, which goes back.
-        """
-        assert self.body is not None
-        outward = self.outward[near]
-        astray = (distance < 0) & ((normal * outward).sum(1) < ASTRAY)
-        rows = np.flatnonzero(astray)
-        if len(rows):
-            points = np.concatenate([self.x, self.x[self.faces].mean(1)])[near[rows]]
-            way = np.arange(1, BEHIND + 1)[:, None] * 0.01
-            behind = points[:, None] - way * outward[rows, None]
-            inside = self.body.penetrating(torch.from_numpy(behind.reshape(-1, 3))).numpy().reshape(len(rows), -1)
-            out = np.logical_or.accumulate(~inside, 1)
-            astray[rows[(out & inside).any(1)]] = False
-        return astray
+            return np.zeros(len(self.x), bool)
+        late = max(0.0, 2 * number / self.settings.rounds - 1)
+        return self.body.leave(self.x, self.settings.body * (1 - 0.9 * late), 1.05 + 3 * late, times)
 
     def _scatter(self, vertices: NDArray, moves: NDArray) -> None:
-        """Add the mean of the moves asked for at each vertex."""
-        total, count = np.zeros_like(self.x), np.bincount(vertices, minlength=len(self.x))
-        np.add.at(total, vertices, moves)
-        self.x += total / np.maximum(count, 1)[:, None]
+        scatter(self.x, vertices, moves)
 
     def _back_to_own_side(self) -> NDArray:
         """Outer vertices beneath an inner layer's faces go back over them, each gives way by half."""
