@@ -119,6 +119,7 @@ COMMANDS = {
     "dataset make": Command("make a set of draped garments", "pipelines.dataset", "DatasetMake", "make_dataset"),
     "dataset pack": Command("pack a set into one file a kind", "pipelines.dataset", "DatasetPack", "pack_dataset"),
     "train isp": Command("learn a garment decoder from a set", "pipelines.train_isp", "TrainIsp", "train_isp"),
+    "encode": Command("a code for any garment mesh", "pipelines.encode", "Encode", "encode", None, "mesh"),
     "train udf": Command("learn encoder and decoder of open meshes", "pipelines.train_udf", "TrainUdf", "train_udf"),
     "train gaps": Command("learn to drape a garment in motion", "pipelines.train_gaps", "TrainGaps", "train_gaps"),
     "train drape-isp": Command(

@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from pipelines import train_udf as t
+from pipelines.encode import Encode, encode
 from pipelines.udf_samples import Sampling, bounds, collect, draw_places
+from recon.files.meshes import write_obj
 from recon.garments import load_decoder
 from recon.garments.dataset import Item
 from recon.garments.mesh_udf import Frame
@@ -217,3 +219,23 @@ def test_distance_losses_are_least_at_the_truth(kind):
 def test_senseless_families_are_refused():
     with pytest.raises(UserError, match="upper, lower"):
         t.train_udf(t.TrainUdf("hats"))
+
+
+def test_a_users_mesh_is_read_turned_moved_and_encoded(trained, tmp_path):
+    """In millimetres, z up and somewhere else: guessed, told, and closer than when it is left where it is."""
+    decoder, state, config, tubes = trained
+    weights = t.store(decoder, config, state, {"unseen": {"field_mm": 5.0}}).parent
+    x, y, z = (1e3 * tubes[0].mesh.vertices).unbind(1)
+    mesh = tubes[0].mesh.with_vertices(torch.stack([x + 300, -z, y + 2000], 1))
+    write_obj(mesh, tmp_path / "a.obj")
+    out = tmp_path / "out"
+    found = encode(Encode((tmp_path / "a.obj",), "skirt", weights=weights, up="z", refine=5, resolution=48, out=out))
+    assert found["known"] in ("well", "roughly") and abs(found["shift"][0] + 0.3) < 0.02 and len(found["code"]) == 32
+    assert any("mm" in note for note in found["notes"]) and any("moved" in note for note in found["notes"])
+    assert json.loads((out / "code.json").read_text())["code"] == found["code"] and (out / "decoded.obj").is_file()
+    kept = encode(Encode((tmp_path / "a.obj",), "skirt", weights=weights, up="z", place="keep", refine=0))
+    assert kept["distance_mm"] > 2 * found["distance_mm"] and kept["known"] == "hardly"
+    with pytest.raises(UserError, match="nothing was overwritten"):
+        encode(Encode((tmp_path / "a.obj",), "skirt", weights=weights, refine=0, out=out))
+    with pytest.raises(UserError, match="hat"):
+        encode(Encode((tmp_path / "a.obj",), "hat", weights=weights))
