@@ -26,7 +26,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -259,11 +259,13 @@ def main() -> None:
     """Measure; write the results, or print one JSON object last."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--garments", type=int, default=FULL.garments, help="test garments of each kind")
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    found = run(QUICK if args.quick else FULL, args.weights, args.quick)
+    whole = replace(FULL, garments=args.garments, pairs=args.garments, simulated=1 if args.garments < 10 else 2)
+    found = run(QUICK if args.quick else whole, args.weights, args.quick)
     if not args.quick:
         out = ROOT / "docs" / "results"
         (out / "drapenet.json").write_text(json.dumps(found, indent=1) + "\n")

@@ -47,13 +47,13 @@ class ScanBodyFit:
     """Directions that the person may face, tried all around."""
     arms: tuple[float, ...] = (0.0, 40.0, 75.0)
     """How far the arms hang down in the starts [degrees]."""
-    points: int = 350
+    points: int = 450
     """Scan points of the first descents."""
-    pairing: int = 3
+    pairing: int = 2
     """Steps of the first descents for which nearest points are kept."""
     fine_points: int = 2000
     """Scan points of the last one."""
-    cell: float = 0.055
+    cell: float = 0.048
     """The thinned body keeps one vertex in each cell of this size [m]."""
     reaches: tuple[float, ...] = (0.3, 0.12, 0.06)
     """Distances at which points stop pulling harder, from coarse to fine [m]."""
@@ -64,8 +64,8 @@ class ScanBodyFit:
     coarse: Descent = field(default_factory=lambda: Descent(steps=45, patience=45))
     """Each of the first descents."""
     fine: tuple[tuple[float, Descent], ...] = (
-        (0.05, Descent(steps=25, patience=25, rate=0.3)),
-        (0.02, Descent(steps=60, patience=20, rate=0.2, tolerance=5e-4)),
+        (0.05, Descent(steps=30, patience=30, rate=0.5)),
+        (0.02, Descent(steps=60, patience=20, rate=0.4, tolerance=5e-4)),
     )
     """The last descents: distance at which a skin point stops pulling harder [m], and steps. All finalists take the
     first, the best one the others."""

@@ -1,0 +1,120 @@
+"""recon scan on scans of known truth: outfits that no decoder saw on random bodies, with noise and holes.
+
+    python benchmarks/scans.py --cases 20              # to docs/results/scan.json and scan.md: minutes a case
+    python benchmarks/scans.py --cases 8 --body        # the body stage alone; prints one JSON object a case
+
+Poses take turns: A, T, standing, and random within the joints' limits; the person faces anywhere. Distances in mm:
+``code`` and ``refined`` are the truth's vertices to the fitted surface (medians; the code's as skinned, before
+refinement), ``body`` the true body's skin to the fitted one's, ``body_vertex`` between the same vertices.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+import torch
+from made_scans import OUTFITS, POSES, MadeScan, make_scan
+
+from pipelines.fit_body import to_body
+from pipelines.fit_scan_body import ScanBodyFit, fit_scan_body
+from pipelines.measure import geometry
+from pipelines.models import load_models
+from pipelines.run import Run
+from pipelines.scan import ScanFit, fit_labelled
+from recon.cloth.contact import BodyContact
+from recon.metrics import surface_distance
+from recon.types import Mesh
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def to_truth(truth: Mesh, found: Mesh) -> torch.Tensor:
+    """(V,) distances of the truth's vertices to the found surface [mm]."""
+    return 1e3 * surface_distance(truth.vertices, found)[0]
+
+
+def body_figures(made: MadeScan, values: dict, body) -> dict:
+    """How far the body is from the true one [mm], and by regions."""
+    with torch.no_grad():
+        found = Mesh(body.pose(to_body(values)).mesh.vertices[0], body.faces)
+    away = 1e3 * (found.vertices - made.body_mesh.vertices).norm(dim=1)
+    skin = to_truth(Mesh(made.body_mesh.vertices[::4], body.faces), found)
+    parts = {name: round(float(away[body.regions == k].mean()), 1) for k, name in enumerate(body.region_names)}
+    return {"body": float(skin.median()), "body_vertex": float(away.median()), "regions": parts}
+
+
+def run_case(number: int, config: ScanFit, body_only: bool) -> dict:
+    """Make and fit one scan."""
+    outfit, pose = OUTFITS[number % len(OUTFITS)], POSES[number % len(POSES)]
+    models = load_models(outfit, config)
+    made = make_scan(outfit, number, pose, models.body, models.draper)
+    row: dict = {"case": number, "outfit": "+".join(outfit), "pose": pose}
+    begin = time.perf_counter()
+    if body_only:
+        values = fit_scan_body(made.scan, models.body, ScanBodyFit())
+        return row | {"seconds": time.perf_counter() - begin, **body_figures(made, values, models.body)}
+    with tempfile.TemporaryDirectory() as folder:
+        run = Run(Path(folder) / "case", {"case": number})
+        values, layers, meshes = fit_labelled(made.scan, models, config, run)
+    row |= {"seconds": time.perf_counter() - begin, **body_figures(made, values, models.body), "garments": {}}
+    with torch.no_grad():
+        posed = models.body.pose(to_body(values))
+        contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
+        for layer in layers:
+            truth, rest = made.garments[layer.name], layer.garment.mesh
+            coded = Mesh(models.draper.drape(layer.garment, posed).vertices[0], rest.faces)
+            row["garments"][layer.name] = {
+                "code": float(to_truth(truth, coded).median()),
+                "refined": float(to_truth(truth, meshes[layer.name]).median()),
+                **geometry(layer, meshes[layer.name], contact),
+            }
+    return row
+
+
+def page(rows: list[dict]) -> str:
+    """The rows as Markdown."""
+    lines = ["# Scans of known truth", "", f"`python benchmarks/scans.py` on {platform.machine()}; distances in mm."]
+    lines += (__doc__ or "").strip().splitlines()[4:]
+    head = ("case", "pose", "garment", "code", "refined", "inside body", "self-crossings", "body", "body vertex", "s")
+    lines += ["", f"| {' | '.join(head)} |"]
+    lines += ["|---" * 10 + "|"]
+    for r in rows:
+        for name, g in r["garments"].items():
+            inside = g["penetrating_vertices"] + g["penetrating_faces"]
+            cells = f"{g['code']:.1f} | {g['refined']:.1f} | {inside} | {g['self_intersections']}"
+            ends = f"{r['body']:.1f} | {r['body_vertex']:.1f} | {r['seconds']:.0f}"
+            lines.append(f"| {r['case']} | {r['pose']} | {name} | {cells} | {ends} |")
+    found = [g for r in rows for g in r["garments"].values()]
+    middle = f"{median(g['code'] for g in found):.1f} | {median(g['refined'] for g in found):.1f}"
+    bodies = f"{median(r['body'] for r in rows):.1f} | {median(r['body_vertex'] for r in rows):.1f}"
+    lines.append(f"| median | | | {middle} | | | {bodies} | {median(r['seconds'] for r in rows):.0f} |")
+    lines += ["", "Aims: code ≤ 12, refined ≤ 4, body ≤ 15, nothing inside the body, 300 s on two cores.", ""]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run the cases; the results are written after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--body", action="store_true")
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    config, rows, out = ScanFit(scan=Path("made")), [], ROOT / "docs" / "results"
+    for number in range(args.first, args.first + args.cases):
+        rows.append(run_case(number, config, args.body))
+        print(json.dumps(rows[-1]), flush=True)
+        if not args.body:
+            (out / "scan.json").write_text(json.dumps(rows, indent=1) + "\n")
+            (out / "scan.md").write_text(page(rows))
+
+
+if __name__ == "__main__":
+    main()
