@@ -299,7 +299,10 @@ def page(figures: dict) -> str:
     """The figures as a page."""
     lines = ["# Draping and layering by networks (ISP Tables 5 and 6)", ""]
     lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
+    lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once):", ""]
+    lines += [", ".join(f"{name} {value}" for name, value in figures["drape_ms"].items()), ""]
     says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body"}
+    lines += ["![Three garments, each draped alone and then layered](isp-layers.jpg)", ""]
     lines += ["| alone | drapes | by | area inside the body, mean | median | strain | to skinning's | median |"]
     lines += ["|---|---|---|---|---|---|---|---|"]
     for kind, f in figures["alone"].items():
