@@ -288,6 +288,7 @@ def main() -> None:
         "seconds": round(time.perf_counter() - began, 1),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {options.threads} threads",
         "torch": torch.__version__,
+        "load": round(os.getloadavg()[0], 1),
     }
     if not options.quick:
         options.out.write_text(json.dumps(figures, indent=1) + "\n")
@@ -299,6 +300,10 @@ def page(figures: dict) -> str:
     """The figures as a page."""
     lines = ["# Draping and layering by networks (ISP Tables 5 and 6)", ""]
     lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
+    lines += [
+        f"Load of the machine while it was measured: {figures['load']} (more than its cores: times are too long).",
+        "",
+    ]
     lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once):", ""]
     lines += [", ".join(f"{name} {value}" for name, value in figures["drape_ms"].items()), ""]
     says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body"}
@@ -315,7 +320,7 @@ def page(figures: dict) -> str:
     lines.append("")
     for kind, number in FIRST.items():
         t = figures["tables"][number]
-        lines += [f"Table {number}: first layer a {kind}, {t['cases']} cases, % of the outer layer's area", ""]
+        lines += [f"Table {number} (first layer: {kind}): {t['cases']} cases, % of the outer layer's area", ""]
         for way, says in (("with", "with D_m"), ("forces", "forces alone"), ("without", "without")):
             lines += [f"| {says} | 1 | 2 | 3 | 4 | 5 |", "|---|---|---|---|---|---|"]
             for i, row in enumerate(t[way]["beneath_pct"]):
