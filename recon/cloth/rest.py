@@ -16,6 +16,9 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import GRAVITY, Cloth
 from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, edge_laplacian, lbfgs, springs
 
+FEWEST = 5
+"""Steps between two searches for contact at least."""
+
 
 @dataclass(frozen=True)
 class Resting:
@@ -83,11 +86,17 @@ def rest(
         return value, gradient
 
     touch = _Touch(energy, body, s, cloth.masses.numpy() * GRAVITY)
-    done, energies, residual = 0, [], np.inf
+    done, energies, residual, before, steps = 0, list[float](), np.inf, x, s.search
     while done < s.iterations:
         touching, spent = touch(x)
         value, gradient = free(x)
-        energies.append(value - spent)
+        if energies and value - spent > energies[-1] and not s.friction and steps > FEWEST:
+            # Planes stand for a curved body only so far: back, and search again after fewer steps.
+            x, steps = before, max(steps // 4, FEWEST)
+            touching, spent = touch(x)
+            value, gradient = free(x)
+        else:
+            energies.append(value - spent)
         residual = float(np.abs(gradient).max(initial=0.0)) / weight
         if residual <= s.tolerance:
             break
@@ -100,9 +109,9 @@ def rest(
             out[held] = 0
             return out
 
-        steps = min(s.search, s.iterations - done)
-        x = lbfgs(free, x, steps, s.memory, metric, longest=0.02, tolerance=s.tolerance * weight)
-        done += steps
+        before, now = x, min(steps, s.iterations - done)
+        x = lbfgs(free, x, now, s.memory, metric, longest=0.02, tolerance=s.tolerance * weight)
+        done, steps = done + now, min(2 * steps, s.search)
     return Rested(x, energies[-1], residual, done, tuple(energies), residual <= s.tolerance)
 
 

@@ -63,6 +63,7 @@ def test_cloth_on_a_ball_stays_outside_and_hangs() -> None:
     away = np.linalg.norm(found.x, axis=1)
     assert away.min() > 0.2 and found.x[:, 1].min() < -0.02
     assert found.energy < found.energies[0]
+    assert all(b <= a for a, b in zip(found.energies, found.energies[1:]))
     middle = np.abs(flat[:, :2] - 0.35).sum(1).argmin()
     assert found.x[middle, 1] == pytest.approx(0.2035, abs=2e-3)  # it lies on top
 
