@@ -14,7 +14,8 @@ import argparse
 import json
 import platform
 import statistics
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -37,6 +38,7 @@ from pipelines.fit_code import CodeFit
 from recon.files.atomic import write_whole
 from recon.garments.dataset import load_items
 from recon.garments.isp import load_isp
+from recon.garments.patterns_drape import FittingRoom
 from recon.types import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -77,31 +79,46 @@ class Kept:
         self.path = path
         self.rows: dict[str, list[dict]] = json.loads(path.read_text()) if path.is_file() else {}
 
-    def get(self, name: str, make: Iterable[dict]) -> list[dict]:
+    def get(self, name: str, make: Callable[[], Iterable[dict]]) -> list[dict]:
         """The rows of one table, measured where they are not there yet."""
         if name not in self.rows:
-            self.rows[name] = list(make)
+            self.rows[name] = list(make())
             write_whole(self.path, json.dumps(self.rows, indent=1))
             print(name, flush=True)
         return self.rows[name]
+
+
+def alone(measure: Callable[..., dict], *arguments) -> list[dict]:
+    """A table of one row."""
+    return [measure(*arguments)]
+
+
+def times(kind: str) -> dict[str, float]:
+    """Decoding times by resolution [ms]."""
+    return {str(r): decode_ms(kind, r, 9) for r in RESOLUTIONS}
+
+
+def floors(kind: str, count: int, where: FittingRoom) -> Iterable[dict]:
+    """The data's own error for each of the unseen garments."""
+    return (floor(item, where) for item in load_items(kind, "test")[:count])
 
 
 def full(options: argparse.Namespace) -> dict[str, list[dict]]:
     """All tables, row by row; the long ones last."""
     kept, where = Kept(options.rows), None
     for kind in KINDS:
-        kept.get(f"pattern {kind}", fits(kind, "pattern", options.unseen, CodeFit()))
-        kept.get(f"seen {kind}", seen(kind, options.seen))
+        kept.get(f"gradient {kind}", partial(alone, gradient_error, kind))
+        kept.get(f"time {kind}", partial(alone, times, kind))
+        kept.get(f"interpolation {kind}", partial(alone, interpolations, kind, options.pairs))
+        kept.get(f"pattern {kind}", partial(fits, kind, "pattern", options.unseen, CodeFit()))
+        kept.get(f"seen {kind}", partial(seen, kind, options.seen))
     for kind in KINDS:
         if f"floor {kind}" not in kept.rows:
             where = where or room()
-            kept.get(f"floor {kind}", [floor(item, where) for item in load_items(kind, "test")[: options.unseen]])
-        kept.get(f"interpolation {kind}", [{"kind": kind} | interpolations(kind, options.pairs)])
-        kept.get(f"gradient {kind}", [{"kind": kind} | gradient_error(kind)])
-        kept.get(f"time {kind}", [{str(r): decode_ms(kind, r, 9) for r in RESOLUTIONS}])
+            kept.get(f"floor {kind}", partial(floors, kind, options.unseen, where))
     for source in SOURCES[1:]:
         for kind in KINDS:
-            kept.get(f"{source} {kind}", fits(kind, source, options.others, CodeFit()))
+            kept.get(f"{source} {kind}", partial(fits, kind, source, options.others, CodeFit()))
     return kept.rows
 
 
@@ -114,7 +131,9 @@ def summary(rows: dict[str, list[dict]]) -> dict:
     """The keys of ``--quick`` over all rows."""
     out: dict = {"surface_mm": {}, "floor_mm": {}, "normal_consistency_pct": {}, "openings_kept": {}}
     for kind in KINDS:
-        found = rows[f"pattern {kind}"]
+        found = rows.get(f"pattern {kind}")
+        if not found:
+            continue
         out["surface_mm"][kind] = round(mean(found, "surface_mm"), 3)
         out["normal_consistency_pct"][kind] = round(100 * mean(found, "normals"), 2)
         out["openings_kept"][kind] = mean(found, "openings")
