@@ -300,10 +300,8 @@ def page(figures: dict) -> str:
     """The figures as a page."""
     lines = ["# Draping and layering by networks (ISP Tables 5 and 6)", ""]
     lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
-    lines += [
-        f"Load of the machine while it was measured: {figures['load']} (more than its cores: times are too long).",
-        "",
-    ]
+    busy = " (more than its cores: times are too long)" if figures["load"] > (os.cpu_count() or 1) else ""
+    lines += [f"Load of the machine when it was measured: {figures['load']}{busy}.", ""]
     lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once):", ""]
     lines += [", ".join(f"{name} {value}" for name, value in figures["drape_ms"].items()), ""]
     says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body"}

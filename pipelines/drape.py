@@ -111,6 +111,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
     figures["before_untangling"] = measure(names, things, layers, posed, body)
     if config.untangle:
         at = time.perf_counter()
+        say("untangle ...")  # seconds for a pair, a minute for a stack
         done = untangle(layers[::-1], Mesh(posed.mesh.vertices[0], body.faces))
         moved = [torch.as_tensor(x).float() for x in done.vertices[::-1]]
         layers = [mesh.with_vertices(x) for mesh, x in zip(layers, moved, strict=True)]
