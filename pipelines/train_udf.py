@@ -60,9 +60,9 @@ class TrainUdf:
     """Places per garment and step (the paper: 20000)."""
     slopes: int = 400
     """How many of them also have their gradient compared (the paper: all)."""
-    encoded: int = 2
+    encoded: int = 4
     """How many garments of a batch go through the encoder."""
-    aim: float = 0.03
+    aim: float = 0.3
     """Weight of the distance between their codes and the aims."""
     loss: Literal["bce", "l1", "l2"] = "bce"
     """Distance loss: binary cross-entropy (Eq. 4), or the alternatives of §7.1."""

@@ -55,7 +55,7 @@ def mesh_udf(field: Field, box: Box, meshing: Meshing | None = None) -> Mesh:
     band = find_band(field, box, meshing.resolution, meshing.steepness, meshing.floor)
     if not len(band.corners):
         return Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long))
-    points, faces = march(band, signs(field, band))
+    points, faces = march(band, signs(field, band, meshing.floor))
     points, faces = cut(field, points, faces, Cutting(band.cell, meshing.beyond))
     return Mesh(torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(_turned_out(points, faces)))
 

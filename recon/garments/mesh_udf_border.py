@@ -48,13 +48,13 @@ def cut(field: Field, points: NDArray, faces: NDArray, cutting: Cutting) -> tupl
     pinholes closed, borders laid on the surface's end and smoothed.
     """
     points, faces = trim(field, points, faces, cutting)
-    if not len(faces):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     for _ in range(2):
+        if not len(faces):
+            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
         faces = peel(points, faces, cutting.cell)
         faces = _without_scraps(points, faces, cutting.scrap * cutting.cell**2)
+        faces = _two_sided(fill_notches(points, faces))
         faces, points = split_pinches(faces, points)
-        faces = fill_notches(points, faces)
         points, faces = close_pinholes(field, *_compact(points, faces), cutting)
         points = smooth_borders(field, points, faces, cutting)
     return points, faces
@@ -65,8 +65,11 @@ def trim(field: Field, points: NDArray, faces: NDArray, cutting: Cutting) -> tup
 
     As in ``panels``: vertices close to the cut move onto it, other edges are cut, so that no slivers arise.
     """
-    distance, gradient = _slope(field, points)
-    beside = _beside(points, faces, distance, gradient)
+    distance, raw = (t.double().numpy() for t in slope(field, torch.as_tensor(points, dtype=torch.float32)))
+    length = np.linalg.norm(raw, axis=1, keepdims=True)
+    gradient = raw / np.maximum(length, 1e-9)
+    # On the surface learned fields are flat, not zero: a short gradient there points anywhere.
+    beside = _beside(points, faces, distance, raw / np.maximum(length, 1.0))
     away, near = beside > cutting.beyond * cutting.cell, SNAP * cutting.cell
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     ends = np.concatenate([ends, ends[:, ::-1]])
@@ -114,6 +117,21 @@ def peel(points: NDArray, faces: NDArray, cell: float) -> NDArray[np.int64]:
     return np.concatenate([rest, zone])
 
 
+def _two_sided(faces: NDArray) -> NDArray[np.int64]:
+    """Faces without those that run along an edge in a direction that another one has: rough fields can make such."""
+    while len(faces):
+        half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        key = half[:, 0] * (np.int64(faces.max()) + 1) + half[:, 1]
+        order = np.argsort(key)
+        again = np.zeros(len(key), bool)
+        again[order[1:]] = key[order[1:]] == key[order[:-1]]
+        bad = again.reshape(3, -1).any(0)
+        if not bad.any():
+            break
+        faces = faces[~bad]
+    return faces
+
+
 def _zone(faces: NDArray, rings: int = 3) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Faces within a few rings of the borders, and the others."""
     near = np.zeros(faces.max() + 1, bool)
@@ -133,6 +151,8 @@ def _touched(faces: NDArray, count: int) -> NDArray[np.bool_]:
 def fill_notches(points: NDArray, faces: NDArray) -> NDArray[np.int64]:
     """Faces with one more wherever the border turns sharply into the surface: what peeling left is no wider than a
     cell."""
+    if not len(faces):
+        return faces
     zone, rest = _zone(faces)
     inner = _touched(rest, len(points))
     for _ in range(NOTCHES):
@@ -140,7 +160,10 @@ def fill_notches(points: NDArray, faces: NDArray) -> NDArray[np.int64]:
         edges = edges[~inner[edges].all(1)]
         before, after = np.full(len(points), -1), np.full(len(points), -1)
         after[edges[:, 0]], before[edges[:, 1]] = edges[:, 1], edges[:, 0]
-        v = np.flatnonzero((after >= 0) & (before >= 0))
+        once = (np.bincount(edges[:, 0], minlength=len(points)) == 1) & (
+            np.bincount(edges[:, 1], minlength=len(points)) == 1
+        )
+        v = np.flatnonzero(once & once[after] & once[before] & (after >= 0) & (before >= 0))
         a, b = before[v], after[v]
         back, on = points[a] - points[v], points[b] - points[v]
         sharp = (back * on).sum(1) > SHARP * np.maximum(_length(back) * _length(on), 1e-18)

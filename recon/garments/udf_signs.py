@@ -41,10 +41,13 @@ class Ends:
     """(E, 3) unit gradients."""
 
 
-def signs(field: Field, band: Band) -> NDArray[np.int8]:
-    """(N,) +1 or -1 per corner of the band, consistent within each connected piece; which side is +1 is arbitrary."""
+def signs(field: Field, band: Band, floor: float = 0.0) -> NDArray[np.int8]:
+    """(N,) +1 or -1 per corner of the band, consistent within each connected piece; which side is +1 is arbitrary.
+
+    ``floor``: distance [m] that the field may show on the surface.
+    """
     edges = band_edges(band)
-    vote = votes(field, band, edges)
+    vote = votes(field, band, edges, floor)
     return _outvoted(_settled(band, edges, vote), band, edges, vote)
 
 
@@ -61,7 +64,7 @@ def band_edges(band: Band) -> NDArray[np.int64]:
     return np.concatenate(parts)
 
 
-def votes(field: Field, band: Band, edges: NDArray[np.int64]) -> NDArray[np.float64]:
+def votes(field: Field, band: Band, edges: NDArray[np.int64], floor: float = 0.0) -> NDArray[np.float64]:
     """(E,) in [-1, 1]: +1 both ends surely on one side, -1 the surface surely passes between them.
 
     Edges that seem to be crossed are asked about once more: where two sheets pass between the ends, or the surface
@@ -76,7 +79,7 @@ def votes(field: Field, band: Band, edges: NDArray[np.int64]) -> NDArray[np.floa
     middle = Ends(at, u, g / np.maximum(np.linalg.norm(g, axis=1, keepdims=True), 1e-9))
     first, second = _vote(a, middle, band.cell), _vote(middle, b, band.cell)
     twice = np.sign(first * second) * np.minimum(np.abs(first), np.abs(second))
-    vote[ask] = np.where(u < HIT * band.cell, vote[ask], twice)
+    vote[ask] = np.where(u < HIT * band.cell + floor, vote[ask], twice)
     return vote
 
 

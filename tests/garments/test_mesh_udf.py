@@ -156,3 +156,18 @@ def test_slopes_come_from_differentiation_or_from_the_field():
 def test_where_there_is_no_surface_there_is_no_mesh():
     mesh = mesh_udf(lambda x: x.square().sum(1).sqrt() + 1, BOX, Meshing(32))
     assert mesh.vertices.shape == (0, 3) and mesh.faces.shape == (0, 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rough_fields_still_give_manifolds(seed):
+    """As half-learned networks are: steep and flat by turns, and never quite zero on the surface."""
+    g = torch.Generator().manual_seed(seed)
+    ways, phases = 25 * torch.randn(12, 3, generator=g), 6 * torch.rand(12, generator=g)
+    exact = cylinder(0.15, 0.2)
+
+    def rough(x):
+        return (exact(x).square() + 0.004**2).sqrt() * (1 + 0.5 * (x @ ways.T + phases).sin().mean(1))
+
+    mesh = mesh_udf(rough, BOX, Meshing(64, steepness=1.5, floor=0.006, beyond=0.4))
+    assert len(mesh.faces) > 1000 and is_manifold(mesh.faces.numpy())
+    assert border_loops(mesh.faces.numpy())
