@@ -84,13 +84,13 @@ def decode(config: Decode, tick: Callable[[int, float], None] | None = None) -> 
     if config.fit is None:
         texture = None if config.texture is None else read_texture(config.texture)
         latent = latent_of(decoder, config.what[1])
-        said = finish(decoder, latent, config)
-        _painted(config, decoder, latent, texture)
+        garment, said = finish(decoder, latent, config)
+        _painted(config, decoder, garment, texture)
         return said
     return _fitted(config, decoder, config.fit, tick)
 
 
-def _painted(config: Decode, decoder: GarmentDecoder, latent: Tensor, texture: Tensor | None) -> None:
+def _painted(config: Decode, decoder: GarmentDecoder, garment: Garment, texture: Tensor | None) -> None:
     """Write the template, and the garment with its texture."""
     if texture is None and config.template is None:
         return
@@ -99,8 +99,6 @@ def _painted(config: Decode, decoder: GarmentDecoder, latent: Tensor, texture: T
     if not isinstance(decoder, IspDecoder):
         raise UserError(f"decoder: found {config.decoder}; textures wanted isp")
     sheet = Sheet.of(decoder.nets.shape)
-    with torch.no_grad():
-        garment = decoder.decode(latent, config.resolution)
     if texture is not None:
         write_textured_glb(unsewn(garment), sheet.coordinates(garment), texture, config.out)
     if config.template is not None:
@@ -118,7 +116,7 @@ def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[
     starts = evidence.starts(Bank.of(decoder))
     found = find_code(decoder, evidence, decoder.codes[starts], config.search, tick)
     spent = time.perf_counter() - begun
-    said = finish(decoder, found.latent, config)
+    said = finish(decoder, found.latent, config)[1]
     evidence.renew(found.latent)
     figures = {k: round(v, 3) for k, v in evidence.figures(found.latent).items()}
     return {**said, **figures, "search_s": round(spent, 1), "start": starts[found.start]}
@@ -147,8 +145,8 @@ class Outputs(Protocol):
     def pattern(self) -> Path | None: ...
 
 
-def finish(decoder: GarmentDecoder, latent: Tensor, wanted: Outputs) -> dict:
-    """Decode one code (z,), write the garment and perhaps the code and the pattern; the figures."""
+def finish(decoder: GarmentDecoder, latent: Tensor, wanted: Outputs) -> tuple[Garment, dict]:
+    """Decode one code (z,), write the garment and perhaps the code and the pattern; the garment and its figures."""
     begun = time.perf_counter()
     with torch.no_grad():
         garment = decoder.decode(latent, wanted.resolution)
@@ -159,7 +157,7 @@ def finish(decoder: GarmentDecoder, latent: Tensor, wanted: Outputs) -> dict:
     if wanted.pattern is not None:
         with torch.no_grad():  # coarse outlines are what people can edit
             write_svg(decoder.decode(latent, min(wanted.resolution, PATTERN_RESOLUTION)), wanted.pattern)
-    return {"file": str(wanted.out), **summary(garment), "decode_ms": round(1e3 * spent)}
+    return garment, {"file": str(wanted.out), **summary(garment), "decode_ms": round(1e3 * spent)}
 
 
 def summary(garment: Garment) -> dict:

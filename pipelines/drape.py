@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 from pipelines.garment_source import load_garment
+from pipelines.palette import SKIN, layer_colour
 from pipelines.pose_source import load_pose
 from recon.bodies import Body, load_body
 from recon.cloth.contact import BodyContact
@@ -29,15 +30,6 @@ from recon.files.meshes import Colour, write_glb, write_obj
 from recon.files.weights import read_manifest
 from recon.metrics import beneath_pct, inside_pct, largest_stretch
 from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
-
-SKIN: Colour = (0.86, 0.69, 0.58)
-COLOURS: tuple[Colour, ...] = (
-    (0.27, 0.51, 0.76),
-    (0.80, 0.42, 0.36),
-    (0.38, 0.62, 0.43),
-    (0.72, 0.55, 0.80),
-    (0.85, 0.68, 0.32),
-)
 
 
 @dataclass(frozen=True)
@@ -251,7 +243,7 @@ def _write(config: Drape, worn: dict[str, Garment | Mesh], body: Mesh, figures: 
         write_obj(part, config.out / f"{name}.obj", name)
     write_obj(body, config.out / "body.obj", "body")
     parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, SKIN)}
-    parts |= {name: (part, COLOURS[k % len(COLOURS)]) for k, (name, part) in enumerate(worn.items())}
+    parts |= {name: (part, layer_colour(k)) for k, (name, part) in enumerate(worn.items())}
     write_glb(parts, config.out / "scene.glb")
     write_whole(config.out / "result.json", json.dumps(figures, indent=1) + "\n")
     return Draped(config.out, worn, body, figures)

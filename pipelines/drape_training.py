@@ -22,6 +22,8 @@ ARMS = torch.tensor(
 """(24,) which joints are the arms'."""
 HELD_OUT = ("jump_turn",)
 """Clips that no training sees, by their files' stems."""
+CLIP_TERMS = "Apache-2.0; learned from motion clips, whose terms hold: of the shipped weights' see THIRD_PARTY.md"
+"""Licence of a network that learned from motion clips."""
 
 
 def read_motions(folder: Path, holdout: Collection[str], body: Body, fps: float) -> list[Motion]:

@@ -94,7 +94,7 @@ def edit(config: Edit, tick: Callable[[int, float], None] | None = None) -> dict
     starts = torch.cat([_moved(config, decoder, latent), decoder.codes[evidence.starts()]])
     found = find_code(decoder, evidence, starts, config.search, tick)
     spent = time.perf_counter() - begun
-    said = finish(decoder, found.latent, config)
+    said = finish(decoder, found.latent, config)[1]
     return {**said, **outline_error(decoder, found.latent, wanted), "search_s": round(spent, 1)}
 
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pipelines.garment_source import load_garment
+from pipelines.palette import SKIN, layer_colour
 from pipelines.run import Run
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import motion_of
@@ -37,8 +38,6 @@ from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
 
 DRAPERS = ("gaps", "simulate", "skinning")
 WRITERS = ("glb", "obj", "pc2", "gif", "mp4")
-SKIN = (0.86, 0.69, 0.58)
-COLOURS = ((0.27, 0.51, 0.76), (0.80, 0.42, 0.36), (0.38, 0.62, 0.43), (0.72, 0.55, 0.80))
 ROUNDS = 40
 """Most rounds of untangling per frame: what has no room in one frame mostly has none in the next."""
 CHUNK = 20
@@ -115,7 +114,7 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     for k, name in reversed(list(enumerate(config.garments))):
         job = lambda _, name=name: drape(name, config, body, pose, posed, worn)  # noqa: E731
         thing, frames = run.stage(f"drape-{_file_name(name)}", job, config=config.draper)
-        worn.insert(0, Moving(thing, frames, COLOURS[k % len(COLOURS)]))
+        worn.insert(0, Moving(thing, frames, layer_colour(k)))
     posed = replace(posed, mesh=posed.mesh.with_vertices(posed.mesh.vertices[LEAD_IN:]))
     worn = [replace(part, frames=part.frames[LEAD_IN:]) for part in worn]
     figures: dict = {"garments": {}, "notes": list(motion.notes), "frames": len(motion.pose), "fps": config.fps}

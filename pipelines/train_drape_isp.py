@@ -6,8 +6,6 @@ strain, bending, gravity and contact with the body; no simulated drapes are need
 
 from __future__ import annotations
 
-import json
-import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe
-from pipelines.drape_training import HELD_OUT, BodySampler, Sampling, read_motions
-from pipelines.training import Budget, Training
+from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
+from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.bodies.rig import PARENTS
 from recon.cloth.frames import FrameWeights
@@ -98,7 +96,7 @@ def train_drape_isp(config: TrainDrapeIsp) -> Path:
     loss = Loss(config, body)
     net = loss.net
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"drape-isp-{config.kind}", net, adam, _settings(config), config.out)
+    training = Training(f"drape-isp-{config.kind}", net, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     training.run(Budget(config.minutes, config.steps), lambda share: loss(generator))
@@ -175,11 +173,6 @@ def moving_joints(followed: Tensor) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def _settings(config: TrainDrapeIsp) -> str:
-    free = {"out", "minutes", "steps", "threads"}
-    return json.dumps({k: str(v) for k, v in asdict(config).items() if k not in free}, sort_keys=True)
-
-
 def store(net: DisplacementNet, config: TrainDrapeIsp, done: Training) -> Path:
     """Write the weights with their card."""
     card = {
@@ -187,13 +180,8 @@ def store(net: DisplacementNet, config: TrainDrapeIsp, done: Training) -> Path:
         "shape": asdict(net.shape),
         "data": f"{config.garments} garments of the decoder isp-{config.kind}; motion clips of {config.motions.name} "
         f"and their mirror images (held out: {', '.join(config.holdout)}), random poses within the joints' limits",
-        "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
-        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions", "start")},
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
-        "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
+        **done.card(config),
+        "licence": CLIP_TERMS,
     }
     if config.start is not None:
         earlier = read_manifest(config.start).get(f"drape-isp-{config.kind}", {})

@@ -7,8 +7,6 @@ in the order field, top and bottom, solver.
 
 from __future__ import annotations
 
-import json
-import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,8 +15,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe, garments_of
-from pipelines.drape_training import HELD_OUT, BodySampler, Sampling, read_motions
-from pipelines.training import Budget, Training
+from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
+from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.cloth.frames import FrameWeights
 from recon.draping.binding import JOINTS, METHODS, BodyField
@@ -101,7 +99,7 @@ def train_drapenet(config: TrainDrapenet) -> Path:
     loss = FieldLoss(config, body, nets) if config.part == "field" else DrapeLoss(config, body, nets)
     learner = {"field": nets.field, "solver": nets.solver}.get(config.part) or nets.drape[config.part]
     adam = torch.optim.Adam(learner.parameters(), config.rate, fused=True)
-    training = Training(f"drapenet-{config.part}", learner, adam, _settings(config), config.out)
+    training = Training(f"drapenet-{config.part}", learner, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     training.run(Budget(config.minutes, config.steps), lambda share: loss(generator))
@@ -287,29 +285,19 @@ def nearest(points: Tensor, x: Tensor, over: Tensor) -> Tensor:
     return (x[:, over] - points[:, :, None]).square().sum(-1).amin(-1).clamp_min(1e-12).sqrt()
 
 
-def _settings(config: TrainDrapenet) -> str:
-    free = {"out", "minutes", "steps", "threads"}
-    return json.dumps({k: str(v) for k, v in asdict(config).items() if k not in free}, sort_keys=True)
-
-
 def store(nets: DrapeNets, card: dict, config: TrainDrapenet, done: Training) -> Path:
     """Write ``drapenet`` with its card; a part learned anew replaces its entry."""
     data = f"{config.garments} garments of the shipped decoders; motion clips of {config.motions.name} and their "
     data += f"mirror images (held out: {', '.join(config.holdout)}), random poses within the joints' limits"
     part = {
         "data": "the body's own weights and shape directions" if config.part == "field" else data,
-        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions")},
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        **done.card(config),
     }
     entry = {
         "what": "DrapeNet's draping networks: skinning field, displacements of tops and bottoms, intersection solver",
         "shape": card["shape"],
         "body": card["body"],
-        "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
-        "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
+        "licence": CLIP_TERMS,
         "parts": {**card["parts"], config.part: part},
     }
     return write_weights("drapenet", dict(nets.state_dict()), entry, config.out, exact=("code.points",))

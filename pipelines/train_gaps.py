@@ -8,17 +8,15 @@ run in the same frame: SNUG's is ``--skinning nearest --inextensibility 0``, NCS
 
 from __future__ import annotations
 
-import json
-import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from pipelines.drape_training import ARMS, HELD_OUT, read_motions
+from pipelines.drape_training import ARMS, CLIP_TERMS, HELD_OUT, read_motions
 from pipelines.garment_source import load_garment
-from pipelines.training import Budget, Training
+from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, inertia, towards_template
@@ -142,7 +140,7 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
     shape = GapsShape(len(template.mesh.vertices), body.n_shape, config.width, config.layers)
     net = GapsNet(shape, smooth_basis(template.mesh.vertices, template.mesh.faces, config.modes))
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"gaps-{config.name}", net, adam, _settings(config), config.out)
+    training = Training(f"gaps-{config.name}", net, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     loss = Loss(template, motions, body, config)
@@ -215,11 +213,6 @@ class Loss:
         return loss, {"loss": loss.item(), **shown, "inertia": float(swung.detach().mean()) / c.frames}
 
 
-def _settings(config: TrainGaps) -> str:
-    free = {"out", "minutes", "steps", "threads"}
-    return json.dumps({k: str(v) for k, v in asdict(config).items() if k not in free}, sort_keys=True)
-
-
 def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done: Training) -> Path:
     """Write ``gaps-<name>`` with its card; everything that ``recon.draping.gaps`` needs to rebuild the draper."""
     thing = template.thing
@@ -230,13 +223,8 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         "shape": asdict(net.shape),
         "skinning": config.skinning,
         "data": f"motion clips of {config.motions.name} and their mirror images; held out: {', '.join(config.holdout)}",
-        "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
-        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions")},
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
-        "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
+        **done.card(config),
+        "licence": CLIP_TERMS,
     }
     if isinstance(thing, Garment):
         names = ("panel_points", "panel_faces", "panel_of_face", "vertex_of_point", "border_labels")

@@ -8,9 +8,7 @@ panel (Sobolev), of normals, of borders and seams, and the gap between the two s
 
 from __future__ import annotations
 
-import json
 import math
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -21,7 +19,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pipelines.isp_samples import GRID, IspSamples, collect, frame
-from pipelines.training import Budget, Training
+from pipelines.training import Budget, Training, settings_of
 from recon.files.weights import write_weights
 from recon.garments.dataset import Item, load_items
 from recon.garments.isp import IspDecoder, Variant, load_isp
@@ -174,7 +172,13 @@ def start(samples: IspSamples, shape: IspShape, config: TrainIsp) -> Training:
         {"params": [learned.codes], "lr": config.code_rate},
     ]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    return Training(f"isp-{config.kind}", learned, adam, _settings(config, len(samples)), config.out)
+    return Training(
+        f"isp-{config.kind}",
+        learned,
+        adam,
+        settings_of(config, ("evaluate", "garments"), count=len(samples)),
+        config.out,
+    )
 
 
 def first_codes(samples: IspSamples, size: int) -> Tensor:
@@ -273,14 +277,6 @@ def _compare(found: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tensor]:
     return {"point": point, "difference": (off * whole).sum() / total, "normal": (turned * whole).sum() / total}
 
 
-def _settings(config: TrainIsp, count: int) -> str:
-    """What a checkpoint must agree with to go on from it."""
-    free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
-    return json.dumps(
-        {**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True
-    )
-
-
 def store(decoder: IspDecoder, config: TrainIsp, done: Training, metrics: dict[str, dict[str, float]]) -> Path:
     """Write ``isp-<kind>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
     tensors = {"codes": decoder.codes, **decoder.nets.state_dict()}
@@ -290,10 +286,7 @@ def store(decoder: IspDecoder, config: TrainIsp, done: Training, metrics: dict[s
         "variants": decoder.variants,
         "parameters": [{k: round(v, 4) for k, v in p.items()} for p in decoder.parameters],
         "data": f"{len(decoder.codes)} generated garments of kind {config.kind}",
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        **done.card(config),
         "licence": "CC0-1.0",
         "metrics": metrics,
     }

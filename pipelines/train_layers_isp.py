@@ -6,8 +6,6 @@ that it keeps off the inner one and yet its own energies stay low. One network s
 
 from __future__ import annotations
 
-import json
-import platform
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -15,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe, garments_of
-from pipelines.drape_training import HELD_OUT, BodySampler, Sampling, read_motions
-from pipelines.training import Budget, Training
+from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
+from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.cloth.energies import collision
 from recon.cloth.frames import FrameWeights
@@ -88,7 +86,7 @@ def train_layers_isp(config: TrainLayersIsp) -> Path:
     torch.manual_seed(config.seed)
     net = LayeringNet()
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training("layers-isp", net, adam, _settings(config), config.out)
+    training = Training("layers-isp", net, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     loss = Loss(config, load_body())
@@ -188,11 +186,6 @@ class Loss:
         return Beneath.all_of(layer, self.rims[k])
 
 
-def _settings(config: TrainLayersIsp) -> str:
-    free = {"out", "minutes", "steps", "threads"}
-    return json.dumps({k: str(v) for k, v in asdict(config).items() if k not in free}, sort_keys=True)
-
-
 def store(net: LayeringNet, config: TrainLayersIsp, done: Training) -> Path:
     """Write the weights with their card."""
     card = {
@@ -200,12 +193,7 @@ def store(net: LayeringNet, config: TrainLayersIsp, done: Training) -> Path:
         "shape": asdict(net.shape),
         "data": f"pairs of {config.garments} garments of each kind's decoder, draped by drape-isp; motion clips of "
         f"{config.motions.name} and their mirror images (held out: {', '.join(config.holdout)}), random poses",
-        "acknowledgement": "mocap.cs.cmu.edu (created with funding from NSF EIA-0196217); AnimatedDrawings (MIT)",
-        "settings": {k: str(v) for k, v in asdict(config).items() if k not in ("out", "motions", "weights")},
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
-        "licence": "Apache-2.0 (learned from motion clips: mind their terms)",
+        **done.card(config),
+        "licence": CLIP_TERMS,
     }
     return write_weights("layers-isp", dict(net.state_dict()), card, config.out)

@@ -8,8 +8,6 @@ distances, which the encoder learns to meet. With ``encoded`` = ``batch`` and ``
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pipelines.training import Budget, Training
+from pipelines.training import Budget, Training, settings_of
 from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect
 from recon.files.weights import write_weights
 from recon.garments.dataset import Item, load_items
@@ -133,7 +131,9 @@ def start(shape: UdfShape, config: TrainUdf, count: int) -> Training:
     torch.manual_seed(config.seed)
     nets = UdfNets(shape)
     adam = torch.optim.Adam(nets.parameters(), lr=config.rate, betas=(0.9, 0.99))
-    return Training(f"udf-{config.family}", nets, adam, _settings(config, count), config.out)
+    return Training(
+        f"udf-{config.family}", nets, adam, settings_of(config, ("evaluate", "garments"), count=count), config.out
+    )
 
 
 def batch_loss(
@@ -206,14 +206,6 @@ def codes_of(nets: UdfNets, samples: UdfSamples) -> Tensor:
     return torch.stack(rows)
 
 
-def _settings(config: TrainUdf, count: int) -> str:
-    """What a checkpoint must agree with to go on from it."""
-    free = {"out", "minutes", "steps", "threads", "evaluate", "garments"}
-    return json.dumps(
-        {**{k: str(v) for k, v in asdict(config).items() if k not in free}, "count": count}, sort_keys=True
-    )
-
-
 def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[str, object]) -> Path:
     """Write ``udf-<family>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
     tensors = {"codes": decoder.all_codes, **decoder.nets.state_dict()}
@@ -225,10 +217,7 @@ def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[s
         "parameters": [{k: round(v, 4) for k, v in known.parameters.items()} for known in decoder.known],
         "data": f"{len(decoder.known)} generated garments of kinds {', '.join(FAMILIES[config.family])}",
         "loss": f"{config.loss}, gradient weight {config.gradient}",
-        "seed": config.seed,
-        "steps": done.step,
-        "minutes": round(done.seconds / 60, 1),
-        "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        **done.card(config),
         "licence": "CC0-1.0",
         "metrics": metrics,
     }

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import platform
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -27,6 +29,16 @@ class Budget:
     """Training time."""
     steps: int = 0
     """So many steps instead; 0 = by the clock."""
+
+
+FREE = ("out", "minutes", "steps", "threads")
+"""Settings that may change between a checkpoint and what goes on from it."""
+
+
+def settings_of(config: Any, free: Collection[str] = (), **more: Any) -> str:
+    """What a checkpoint must agree with: all settings but ``FREE`` and ``free``, and ``more``."""
+    kept = {k: str(v) for k, v in asdict(config).items() if k not in (*FREE, *free)}
+    return json.dumps({**kept, **more}, sort_keys=True)
 
 
 @dataclass
@@ -50,6 +62,17 @@ class Training:
     def checkpoint(self) -> Path:
         """The checkpoint's file."""
         return self.out / f"{self.name}.checkpoint"
+
+    def card(self, config: Any) -> dict[str, Any]:
+        """What the card of every network says of its training; folders of this machine stay out of it."""
+        told = {k: str(v) for k, v in asdict(config).items() if v is not None and not isinstance(v, Path)}
+        return {
+            "settings": told,
+            "seed": config.seed,
+            "steps": self.step,
+            "minutes": round(self.seconds / 60, 1),
+            "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+        }
 
     def save(self) -> None:
         """Write the checkpoint, whole or not at all."""
