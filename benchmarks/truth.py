@@ -27,8 +27,11 @@ SIZE = (800, 600)
 OUTFITS = (("top", "trousers"), ("top", "skirt"), ("dress",))
 CLOSE_HANDS = 0.35
 """Share of a random pose that is kept: standing people, not acrobats."""
-TRUSTED = BodyFit(bones=100.0, upright=0.02, straight=0.01)
-"""The made landmarks' directions in space are exact, so they weigh as such; those of a photo lean by 10-20 degrees."""
+NOISE = 0.01
+"""Standard deviation of the made landmarks in the photo and in space, in units of the person's height."""
+TRUSTED = BodyFit(places=60.0, shape=0.2, upright=0.02, straight=0.01)
+"""The made landmarks lie where they should in space but for that noise, so they weigh as such; a network's guess of a
+photo leans by 10-20 degrees."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ def random_body(models: Models, generator: torch.Generator) -> BodyPose:
 
 
 def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
-    """Dress the body by simulation, render the masks, and note the body's own landmarks with 1 % noise."""
+    """Dress the body by simulation, render the masks, and note the body's own landmarks with their noise."""
     generator = torch.Generator().manual_seed(1000 + number)
     place = random_body(models, generator)
     camera = Camera(
@@ -79,8 +82,9 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
         image = renderer([m.vertices for m in parts], camera, SIZE)
         points = models.body.landmarks(posed)[0]
         pixels = camera.project(points)
-    noise = torch.randn(33, 2, generator=generator) * 0.01 * (pixels[:, 1].max() - pixels[:, 1].min())
-    world = points - (points[23] + points[24]) / 2
+    noise = torch.randn(33, 2, generator=generator) * NOISE * (pixels[:, 1].max() - pixels[:, 1].min())
+    height = points[:, 1].max() - points[:, 1].min()
+    world = points - (points[23] + points[24]) / 2 + NOISE * height * torch.randn(33, 3, generator=generator)
     photo = Photo(
         rgb=torch.zeros(*SIZE, 3, dtype=torch.uint8),
         person=image.sum(0).clamp(0, 1),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
 import torch
+import tyro
 from torch import Tensor
 
 from pipelines.codes import Decoding, retrieved
@@ -59,6 +61,8 @@ class GarmentFit:
     """Weight that keeps body and camera near what the body stage found (unit: 0.1 rad, 0.02 m, 0.1 log, 0.5 shape)."""
     outer: float = 0.5
     """Weight of each outer layer's overlap, relative to this garment's."""
+    body: Annotated[BodyFit, tyro.conf.Suppress] = field(default_factory=BodyFit)
+    """What landmarks and priors still ask of body and camera while they settle; ``fit_evidence`` puts the body stage's."""
     descent: Descent = field(default_factory=lambda: Descent(patience=12))
     """Shared settings of the levels; ``steps`` is taken from ``levels``."""
 
@@ -193,7 +197,7 @@ class GarmentLoss:
         loss = loss + s.mahalanobis * self.prior.energy(values["latent"])
         loss = loss + s.neighbourhood * self.known.energy(values["latent"])
         loss = loss + s.anchor * anchor_loss(values, self.anchors) / 10
-        return loss + 0.1 * evidence_loss(values, posed, models.body, self.photo, BodyFit())
+        return loss + 0.1 * evidence_loss(values, posed, models.body, self.photo, s.body)
 
 
 def fit_garment(

@@ -119,11 +119,12 @@ def fit_evidence(
         "body", lambda s: fit_body(photo, models.body, models.renderer_of, s, tick), config=config.body_fit
     )
     layers: list[Layer] = []
+    settings = replace(config.garment_fit, body=config.body_fit)
     for name in photo.garments:
         values, layer = run.stage(
             name,
             lambda s, name=name, values=values: fit_garment(name, values, layers, photo, models, s, tick),
-            config=config.garment_fit,
+            config=settings,
         )
         layers.append(layer)
     refined = run.stage("refine", lambda s: refine(values, layers, photo, models, s, tick), config=config.refinement)

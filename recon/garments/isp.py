@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.isp_lattice import Stencils, lattice_stencils
+from recon.garments.isp_lattice import Ahead, Stencils, inner_nodes, lattice_stencils, node_places
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
@@ -24,6 +25,8 @@ FAR = 1.0
 """Signed distance written where a coarse cell rules the border out [domain units]."""
 MAX_STEP = 0.5
 """Longest projection step, in cells."""
+SECOND = ThreadPoolExecutor(1, "surface map")
+"""The core that numpy leaves idle while it cuts and sews."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,13 @@ class IspDecoder:
         code = latent.detach()
         with torch.no_grad():
             field = self.nets.pattern.fold(code)
-            sewn = self._cut_and_sew(field, resolution)
+            distance = self._distance_grid(field, resolution)
+            ahead = self._lift_ahead(latent, distance) if self._may_lift_ahead(latent) else None
+            sewn = self._cut_and_sew(field, distance)
         plan = _Plan.make(sewn, latent, resolution)
         steps = 2.0 / resolution * MAX_STEP
         points = self._on_border(field, plan, plan.points, steps, 1)
-        return self._remember(self._garment(latent, replace(plan, points=points), None), plan)
+        return self._remember(self._garment(latent, replace(plan, points=points), None, ahead), plan)
 
     def decode_like(self, latent: Tensor, garment: Garment) -> Garment:
         """``garment`` (decoded by this decoder) re-evaluated at a code nearby: same topology, its border re-projected.
@@ -111,9 +116,26 @@ class IspDecoder:
         at = self.nets.to_domain(x)
         return self.nets.to_world(self.nets.lift(self.nets.surface.run_folded(self.nets.surface.fold(latent), at), at))
 
-    def _cut_and_sew(self, field: list[Layer], resolution: int):
-        distance = self._distance_grid(field, resolution)
-        cell = 2.0 / resolution
+    def _may_lift_ahead(self, latent: Tensor) -> bool:
+        wanted = latent.requires_grad and torch.is_grad_enabled()
+        return not wanted and latent.device.type == "cpu" and torch.get_num_threads() > 1
+
+    def _lift_ahead(self, latent: Tensor, distance: np.ndarray) -> Ahead | None:
+        """Start lifting the lattice's inner nodes on a second core, while the first cuts and sews in numpy."""
+        nodes = inner_nodes(distance)
+        if not len(nodes):
+            return None
+        code = latent.detach()
+
+        def lift() -> Tensor:
+            with torch.no_grad():
+                x = torch.as_tensor(node_places(nodes), dtype=code.dtype)
+                return self.nets.surface.run_folded(self.nets.surface.fold(code), x)
+
+        return Ahead(nodes, SECOND.submit(lift))
+
+    def _cut_and_sew(self, field: list[Layer], distance: np.ndarray):
+        cell = 2.0 / (len(distance) - 1)
         panels, labels = [], []
         for k in (0, 1):
             panel = cut_panel(distance[:, :, k])
@@ -121,7 +143,8 @@ class IspDecoder:
                 raise UserError(f"{self.kind}: the code describes no garment; start from a learned code")
             border = panel.border
             start = torch.as_tensor(panel.points[border], dtype=self.codes.dtype, device=self.codes.device)
-            target, logits = self._project(field, start, torch.full((len(border),), k), MAX_STEP * cell, 1)
+            panel_of = torch.full((len(border),), k, device=start.device)
+            target, logits = self._project(field, start, panel_of, MAX_STEP * cell, 1, exact=False)
             points = move_safely(panel.points, panel.faces, border, target.cpu().double().numpy())
             panels.append(replace(panel, points=points))
             labels.append(logits.argmax(-1).cpu().numpy())
@@ -155,21 +178,30 @@ class IspDecoder:
         with torch.autocast(x.device.type, torch.bfloat16, enabled=halves_are_fast(x.device)):
             return self.nets.pattern.run_folded(field, x)[:, :2].to(x.dtype)
 
-    def _slope(self, field: list[Layer], x: Tensor, panel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Signed distance (N,), its gradient (N, 2) in x, and label logits (N, L) of each point's own panel."""
-        with torch.enable_grad():
+    def _slope(self, field: list[Layer], x: Tensor, panel: Tensor, halves: bool = False):
+        """Signed distance (N,), its gradient (N, 2) in x, and label logits (N, L) of each point's own panel.
+
+        ``halves``: in half precision, where it is fast.
+        """
+        with torch.enable_grad(), torch.autocast(x.device.type, torch.bfloat16, enabled=halves):
             at = x.detach().requires_grad_()
             distance, logits = self.nets.split_pattern(self.nets.pattern.run_folded(field, at))
             row = torch.arange(len(x), device=x.device)
             own = distance[row, panel]
             (slope,) = torch.autograd.grad(own.sum(), at)
-        return own.detach(), slope, logits.detach()[row, panel]
+        return own.detach().to(x.dtype), slope, logits.detach()[row, panel]
 
-    def _project(self, field: list[Layer], x: Tensor, panel: Tensor, longest: float, rounds: int):
-        """Points moved along the gradient onto the zero level (B.2), in all at most ``longest``; with their logits."""
-        start = x
+    def _project(self, field: list[Layer], x: Tensor, panel: Tensor, longest: float, rounds: int, exact: bool = True):
+        """Points moved along the gradient onto the zero level (B.2), in all at most ``longest``; with their logits.
+
+        The way there may be rough, its length must be ``exact`` for the points to lie on the border.
+        """
+        start, halves = x, halves_are_fast(x.device)
+        row = torch.arange(len(x), device=x.device)
         for _ in range(rounds):
-            own, slope, logits = self._slope(field, x, panel)
+            own, slope, logits = self._slope(field, x, panel, halves)
+            if exact and halves:
+                own = self.nets.pattern.run_folded(field, x.detach())[row, panel]
             step = own[:, None] * slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
             away = x - step - start
             x = start + away * (longest / away.norm(dim=1, keepdim=True).clamp_min(longest))
@@ -180,7 +212,7 @@ class IspDecoder:
         points[plan.border] = self._project(field, points[plan.border], plan.border_panel, longest, rounds)[0]
         return points
 
-    def _garment(self, latent: Tensor, plan: _Plan, like: Garment | None) -> Garment:
+    def _garment(self, latent: Tensor, plan: _Plan, like: Garment | None, ahead: Ahead | None = None) -> Garment:
         """Lift the plan's points; border points move with the code as Eq. 6 says: dx/dz = -∇s (∂s/∂z) / |∇s|²."""
         nets, points = self.nets, plan.points
         border = points[plan.border]
@@ -191,7 +223,8 @@ class IspDecoder:
             step = slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
             border = border - step * (own - own.detach())[:, None]
         x = torch.cat([points[plan.inner], border])
-        raw = nets.surface.run_folded(nets.surface.fold(latent), x)
+        surface = nets.surface.fold(latent)
+        raw = nets.surface.run_folded(surface, x) if ahead is None else self._rest(surface, x, ahead)
         between = plan.lattice.interpolate(raw)
         x = torch.cat([x, points[plan.between]])
         own = nets.lift(torch.cat([raw, between]), x).flatten(0, 1)[plan.lifted_row]
@@ -213,6 +246,15 @@ class IspDecoder:
             latent=latent,
             variant=self._variant_near(latent),
         )
+
+    def _rest(self, surface: list[Layer], x: Tensor, ahead: Ahead) -> Tensor:
+        """Raw surface map (N, 6) at x (N, 2), of which some rows were lifted ahead."""
+        row = torch.as_tensor(ahead.rows_of(x.numpy()))
+        left = row < 0
+        raw = torch.empty(len(x), 6, dtype=x.dtype)
+        raw[left] = self.nets.surface.run_folded(surface, x[left])
+        raw[~left] = ahead.lifted.result()[row[~left]]
+        return raw
 
     def _variant_near(self, latent: Tensor) -> str:
         return self.variants[int((self.codes - latent.detach()).square().sum(1).argmin())]

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, depth_first_order
 
 from recon.types import Garment
 
@@ -201,16 +203,13 @@ def split_pinches(faces: NDArray, points: NDArray, rim: NDArray | None = None) -
 def border_loops(faces: NDArray, rim: NDArray | None = None) -> list[NDArray]:
     """Closed border loops of a mesh without pinched vertices, longest first; ``rim`` as in ``border_edges``."""
     edges = border_edges(faces, rim)
-    following = dict(zip(edges[:, 0].tolist(), edges[:, 1].tolist(), strict=True))
-    loops = []
-    while following:
-        start, vertex = following.popitem()
-        loop = [start]
-        while vertex != start:
-            loop.append(vertex)
-            vertex = following.pop(vertex)
-        loops.append(np.array(loop))
-    return sorted(loops, key=len, reverse=True)
+    names, ends = np.unique(edges, return_inverse=True)
+    ends = ends.reshape(-1, 2)
+    following = csr_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(len(names), len(names)))
+    count, loop_of = connected_components(following, directed=False)
+    starts = np.unique(loop_of, return_index=True)[1]
+    walks = [depth_first_order(following, start, return_predecessors=False) for start in starts]
+    return sorted((names[walk] for walk in walks), key=len, reverse=True)
 
 
 def waistband(garment: Garment) -> NDArray:

@@ -182,27 +182,34 @@ def merge_parameters(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray,
 
     Interior points closer than ``tolerance`` share their mean; the others stay alone.
     """
-    t, ia, ib = [0.0], [0], [0]
-    i, j = 1, 1
-    while i < len(a) - 1 or j < len(b) - 1:
-        x = a[i] if i < len(a) - 1 else np.inf
-        y = b[j] if j < len(b) - 1 else np.inf
-        if abs(x - y) <= tolerance:
-            t.append(0.5 * (x + y))
-            ia.append(i)
-            ib.append(j)
-            i, j = i + 1, j + 1
-        elif x < y:
-            t.append(x)
-            ia.append(i)
-            ib.append(-1)
-            i += 1
-        else:
-            t.append(y)
-            ia.append(-1)
-            ib.append(j)
-            j += 1
-    return np.array([*t, 1.0]), np.array([*ia, len(a) - 1]), np.array([*ib, len(b) - 1])
+    inner = [np.arange(1, len(side) - 1) for side in (a, b)]
+    i, j = _mutual(a[inner[0]], b[inner[1]], tolerance)
+    i, j = i + 1, j + 1
+    alone = [np.setdiff1d(of, used, assume_unique=True) for of, used in zip(inner, (i, j))]
+    t = np.concatenate([[0.0, 1.0], 0.5 * (a[i] + b[j]), a[alone[0]], b[alone[1]]])
+    none = [np.full(len(k), -1) for k in alone]
+    ia = np.concatenate([[0, len(a) - 1], i, alone[0], none[1]])
+    ib = np.concatenate([[0, len(b) - 1], j, none[0], alone[1]])
+    order = np.argsort(t, kind="stable")
+    order = np.concatenate([[0], order[(order != 0) & (order != 1)], [1]])  # the ends stay the ends
+    return t[order], ia[order], ib[order]
+
+
+def _mutual(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray]:
+    """Pairs (rows of a, rows of b) of rising numbers that are each other's nearest and closer than ``tolerance``."""
+    if not len(a) or not len(b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    to_b, to_a = _nearest(a, b), _nearest(b, a)
+    rows = np.nonzero((to_a[to_b] == np.arange(len(a))) & (np.abs(b[to_b] - a) <= tolerance))[0]
+    return rows, to_b[rows]
+
+
+def _nearest(x: NDArray, among: NDArray) -> NDArray[np.int64]:
+    """(N,) rows of the rising numbers ``among`` that are nearest to x (N,)."""
+    after = np.searchsorted(among, x).clip(1, max(len(among) - 1, 1))
+    last = len(among) - 1
+    before = after - 1
+    return np.where(np.abs(among[before] - x) <= np.abs(among[np.minimum(after, last)] - x), before, after).clip(0, last)
 
 
 class _Growing:
@@ -219,13 +226,7 @@ class _Growing:
         self.face_at: dict[tuple[int, int], int] = {}
         on_border = np.zeros(len(panel.points), bool)
         on_border[panel.border] = True
-        rim = np.nonzero(corners(on_border[panel.faces]) >= 2)[0]
-        owner: dict[tuple[int, int], int] = {}
-        for f, (a, b, c) in zip(rim.tolist(), panel.faces[rim].tolist(), strict=True):
-            owner[(a, b)] = owner[(b, c)] = owner[(c, a)] = f
-        for loop in panel.loops:
-            for edge in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
-                self.face_at[edge] = owner[edge]
+        self.rim = np.nonzero(corners(on_border[panel.faces]) >= 2)[0]
 
     def face(self, f: int) -> tuple[int, ...]:
         """A face, old or new."""
@@ -233,9 +234,7 @@ class _Growing:
 
     def insert(self, a: int, b: int, place: NDArray, label: int) -> int:
         """A new vertex on the border edge between a and b (either direction); returns its index."""
-        if (a, b) not in self.face_at:
-            a, b = b, a
-        f = self.face_at.pop((a, b))
+        f, a, b = self._owner(a, b)
         face = self.face(f)
         c = face[(face.index(a) + 2) % 3]
         new, beyond = len(self.moved) + len(self.new_points), len(self.faces) + len(self.new_faces)
@@ -246,10 +245,18 @@ class _Growing:
         else:
             self.new_faces[f - len(self.faces)] = (a, new, c)
         self.new_faces.append((new, b, c))
-        self.face_at[(a, new)], self.face_at[(new, b)] = f, beyond
-        if (b, c) in self.face_at:
-            self.face_at[(b, c)] = beyond
+        self.face_at.update({(new, b): beyond, (b, c): beyond})
         return new
+
+    def _owner(self, a: int, b: int) -> tuple[int, int, int]:
+        """The face at the border edge between a and b, and its ends in the face's order."""
+        for edge in ((a, b), (b, a)):
+            if edge in self.face_at:
+                return self.face_at[edge], *edge
+        near = self.faces[self.rim]
+        f = int(self.rim[corners((near == a) | (near == b)) == 2][0])
+        face = self.face(f)
+        return (f, a, b) if face[(face.index(a) + 1) % 3] == b else (f, b, a)
 
     def thread(self, chain: Chain, t: NDArray, index: NDArray) -> NDArray:
         """Bring the chain to the arc lengths t; index says which of its points each is (-1: inserted)."""

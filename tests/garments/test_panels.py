@@ -111,6 +111,18 @@ def test_arc_lengths_and_their_common_places():
     np.testing.assert_allclose(arc_lengths(np.array([[0.0, 0], [0, 3], [4, 3]])), [0, 3 / 7, 1])
 
 
+def test_common_places_rise_and_keep_every_point():
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        a, b = (np.sort(np.r_[0, rng.random(rng.integers(0, 30)), 1]) for _ in range(2))
+        t, ia, ib = merge_parameters(a, b, 0.02)
+        assert (np.diff(t) >= 0).all() and t[0] == 0 and t[-1] == 1
+        assert (ia[ia >= 0] == np.arange(len(a))).all() and (ib[ib >= 0] == np.arange(len(b))).all()
+        both = (ia >= 0) & (ib >= 0)
+        assert (np.abs(a[ia[both]] - b[ib[both]]) <= 0.02).all()
+        assert ((ia >= 0) | (ib >= 0)).all()
+
+
 def side_labels(panel):
     """Left and right sides are seams 2 and 1, top and bottom are open."""
     p = panel.points[panel.border]

@@ -1,5 +1,7 @@
 """The body stage recovers a body that it is shown."""
 
+from dataclasses import replace
+
 import torch
 
 from pipelines.fit_body import BodyFit, evidence_loss, fit_body, start_values, to_body, to_camera
@@ -31,6 +33,17 @@ def test_recovers_silhouette_and_joints():
     assert hard_iou(image, photo.person[None])[0] > 0.85
     local = [p.joints[0] - p.joints[0, :1] for p in (posed, true)]
     assert (local[0] - local[1]).norm(dim=1).mean() < 0.08
+
+
+def test_places_in_space_bring_back_what_one_view_hides():
+    body = load_body()
+    photo, true = made_photo(body), body.pose(made_body(body))
+    off = []
+    for places in (0.0, 60.0):
+        posed = body.pose(to_body(fit_body(photo, body, LabelRenderer, replace(QUICK, places=places))))
+        local = [p.joints[0] - p.joints[0, :1] for p in (posed, true)]
+        off.append((local[0] - local[1]).norm(dim=1).mean().item())
+    assert off[1] < 0.03 and off[1] < off[0]
 
 
 def test_loss_is_finite_without_a_visible_landmark():
