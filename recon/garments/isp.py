@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.isp_lattice import Ahead, Stencils, inner_nodes, lattice_stencils, node_places
+from recon.garments.isp_lattice import Stencils, lattice_stencils
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
@@ -25,8 +24,6 @@ FAR = 1.0
 """Signed distance written where a coarse cell rules the border out [domain units]."""
 MAX_STEP = 0.5
 """Longest projection step, in cells."""
-SECOND = ThreadPoolExecutor(1, "surface map")
-"""The core that numpy leaves idle while it cuts and sews."""
 
 
 @dataclass(frozen=True)
@@ -80,13 +77,11 @@ class IspDecoder:
         code = latent.detach()
         with torch.no_grad():
             field = self.nets.pattern.fold(code)
-            distance = self._distance_grid(field, resolution)
-            ahead = self._lift_ahead(latent, distance) if self._may_lift_ahead(latent) else None
-            sewn = self._cut_and_sew(field, distance)
+            sewn = self._cut_and_sew(field, self._distance_grid(field, resolution))
         plan = _Plan.make(sewn, latent, resolution)
         steps = 2.0 / resolution * MAX_STEP
         points = self._on_border(field, plan, plan.points, steps, 1)
-        return self._remember(self._garment(latent, replace(plan, points=points), None, ahead), plan)
+        return self._remember(self._garment(latent, replace(plan, points=points), None), plan)
 
     def decode_like(self, latent: Tensor, garment: Garment) -> Garment:
         """``garment`` (decoded by this decoder) re-evaluated at a code nearby: same topology, its border re-projected.
@@ -115,24 +110,6 @@ class IspDecoder:
         """A_Φ at panel points x (N, 2) [m] -> (N, 2, 3) points of front and back in rest space [m]."""
         at = self.nets.to_domain(x)
         return self.nets.to_world(self.nets.lift(self.nets.surface.run_folded(self.nets.surface.fold(latent), at), at))
-
-    def _may_lift_ahead(self, latent: Tensor) -> bool:
-        wanted = latent.requires_grad and torch.is_grad_enabled()
-        return not wanted and latent.device.type == "cpu" and torch.get_num_threads() > 1
-
-    def _lift_ahead(self, latent: Tensor, distance: np.ndarray) -> Ahead | None:
-        """Start lifting the lattice's inner nodes on a second core, while the first cuts and sews in numpy."""
-        nodes = inner_nodes(distance)
-        if not len(nodes):
-            return None
-        code = latent.detach()
-
-        def lift() -> Tensor:
-            with torch.no_grad():
-                x = torch.as_tensor(node_places(nodes), dtype=code.dtype)
-                return self.nets.surface.run_folded(self.nets.surface.fold(code), x)
-
-        return Ahead(nodes, SECOND.submit(lift))
 
     def _cut_and_sew(self, field: list[Layer], distance: np.ndarray):
         cell = 2.0 / (len(distance) - 1)
@@ -212,7 +189,7 @@ class IspDecoder:
         points[plan.border] = self._project(field, points[plan.border], plan.border_panel, longest, rounds)[0]
         return points
 
-    def _garment(self, latent: Tensor, plan: _Plan, like: Garment | None, ahead: Ahead | None = None) -> Garment:
+    def _garment(self, latent: Tensor, plan: _Plan, like: Garment | None) -> Garment:
         """Lift the plan's points; border points move with the code as Eq. 6 says: dx/dz = -∇s (∂s/∂z) / |∇s|²."""
         nets, points = self.nets, plan.points
         border = points[plan.border]
@@ -223,8 +200,7 @@ class IspDecoder:
             step = slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
             border = border - step * (own - own.detach())[:, None]
         x = torch.cat([points[plan.inner], border])
-        surface = nets.surface.fold(latent)
-        raw = nets.surface.run_folded(surface, x) if ahead is None else self._rest(surface, x, ahead)
+        raw = nets.surface.run_folded(nets.surface.fold(latent), x)
         between = plan.lattice.interpolate(raw)
         x = torch.cat([x, points[plan.between]])
         own = nets.lift(torch.cat([raw, between]), x).flatten(0, 1)[plan.lifted_row]
@@ -246,15 +222,6 @@ class IspDecoder:
             latent=latent,
             variant=self._variant_near(latent),
         )
-
-    def _rest(self, surface: list[Layer], x: Tensor, ahead: Ahead) -> Tensor:
-        """Raw surface map (N, 6) at x (N, 2), of which some rows were lifted ahead."""
-        row = torch.as_tensor(ahead.rows_of(x.numpy()))
-        left = row < 0
-        raw = torch.empty(len(x), 6, dtype=x.dtype)
-        raw[left] = self.nets.surface.run_folded(surface, x[left])
-        raw[~left] = ahead.lifted.result()[row[~left]]
-        return raw
 
     def _variant_near(self, latent: Tensor) -> str:
         return self.variants[int((self.codes - latent.detach()).square().sum(1).argmin())]

@@ -5,7 +5,6 @@ Only where all points of a stencil lie in the panel: outside of it the surface m
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,38 +16,6 @@ from torch import Tensor
 CELLS = 128
 """Cells of the lattice along the domain's side: up to this resolution nothing is interpolated. Cloth of our data has no
 folds that its cubics would miss: 0.01 mm on average at a resolution of 256."""
-
-
-@dataclass(frozen=True)
-class Ahead:
-    """Lattice nodes whose surface map is asked for before the panels are cut."""
-
-    nodes: NDArray[np.int64]
-    """(N, 2) lattice coordinates."""
-    lifted: Future[Tensor]
-    """(N, C) the network's answers."""
-
-    def rows_of(self, points: NDArray) -> NDArray[np.int64]:
-        """(P,) the row of each point (P, 2) among the nodes, -1 where it is none of them."""
-        at = np.full((CELLS + 1, CELLS + 1), -1)
-        at[tuple(self.nodes.T)] = np.arange(len(self.nodes))
-        place = (points + 1) * (CELLS / 2)
-        near = np.round(place).astype(np.int64)
-        off = np.abs(place - near) > 1e-4
-        return np.where(off[:, 0] | off[:, 1], -1, at[tuple(near.clip(0, CELLS).T)])
-
-
-def inner_nodes(distance: NDArray) -> NDArray[np.int64]:
-    """(N, 2) lattice nodes inside a panel by its distances (R+1, R+1, 2); none where R is no multiple of the lattice."""
-    step = (len(distance) - 1) // CELLS
-    if step < 2 or (len(distance) - 1) % CELLS:
-        return np.zeros((0, 2), np.int64)
-    return np.argwhere(distance[::step, ::step].min(-1) < 0)
-
-
-def node_places(nodes: NDArray) -> NDArray[np.float64]:
-    """(N, 2) domain coordinates of lattice nodes."""
-    return nodes * (2.0 / CELLS) - 1
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,10 @@
 """Interpolating the surface map on fine grids."""
 
-from concurrent.futures import Future
-
 import numpy as np
 import torch
 
 from recon.garments import load_decoder
-from recon.garments.isp_lattice import CELLS, Ahead, cubic_weights, inner_nodes, lattice_stencils, node_places
+from recon.garments.isp_lattice import CELLS, cubic_weights, lattice_stencils
 
 
 def grid(resolution: int) -> np.ndarray:
@@ -58,28 +56,3 @@ def test_interpolated_garment_is_the_surface_map() -> None:
     assert float(off.mean()) < 3e-5
     assert float(off.max()) < 1e-3
 
-
-def test_lifting_ahead_changes_nothing() -> None:
-    decoder, threads = load_decoder("trousers"), torch.get_num_threads()
-    found = []
-    try:
-        for count in (1, 2):  # on one core nothing is lifted ahead
-            torch.set_num_threads(count)
-            with torch.no_grad():
-                found.append(decoder.decode(decoder.codes[5], 256))
-    finally:
-        torch.set_num_threads(threads)
-    torch.testing.assert_close(found[0].mesh.faces, found[1].mesh.faces)
-    torch.testing.assert_close(found[0].mesh.vertices, found[1].mesh.vertices, atol=1e-5, rtol=0)
-
-
-def test_nodes_ahead_are_found_again() -> None:
-    distance = np.full((2 * CELLS + 1, 2 * CELLS + 1, 2), 1.0)
-    distance[100:140, 90:160, 1] = -1.0
-    nodes = inner_nodes(distance)
-    ahead = Ahead(nodes, Future())
-    places = node_places(nodes)
-    np.testing.assert_array_equal(ahead.rows_of(places), np.arange(len(nodes)))
-    np.testing.assert_array_equal(ahead.rows_of(places + 0.3 / CELLS), -1)
-    assert len(nodes) == 20 * 35
-    assert not len(inner_nodes(distance[:CELLS]))
