@@ -53,8 +53,8 @@ class BodyFit:
     bones: float = 6.0
     """Weight of limb directions in space against the landmark network's guess."""
     places: float = 0.0
-    """Weight of the landmarks' places in space about their middle (robust beyond 0.1 m): 0 for a network's guess of a photo,
-    which leans by 10-20 degrees; worth much where they were measured."""
+    """Weight of the landmarks' places in space about their middle (robust beyond 0.1 m): 0 for a network's guess of a
+    photo, which leans by 10-20 degrees; worth much where they were measured."""
     size: float = 0.5
     """Weight of the body's size (unit: 5 %) against the landmark network's guess in metres: one view alone hardly tells
     a tall person far away from a short one close by."""

@@ -62,7 +62,7 @@ class GarmentFit:
     outer: float = 0.5
     """Weight of each outer layer's overlap, relative to this garment's."""
     body: Annotated[BodyFit, tyro.conf.Suppress] = field(default_factory=BodyFit)
-    """What landmarks and priors still ask of body and camera while they settle; ``fit_evidence`` puts the body stage's."""
+    """What landmarks and priors still ask of body and camera while they settle; ``fit_evidence`` sets it."""
     descent: Descent = field(default_factory=lambda: Descent(patience=12))
     """Shared settings of the levels; ``steps`` is taken from ``levels``."""
 

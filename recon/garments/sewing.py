@@ -206,10 +206,10 @@ def _mutual(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray]
 
 def _nearest(x: NDArray, among: NDArray) -> NDArray[np.int64]:
     """(N,) rows of the rising numbers ``among`` that are nearest to x (N,)."""
-    after = np.searchsorted(among, x).clip(1, max(len(among) - 1, 1))
     last = len(among) - 1
-    before = after - 1
-    return np.where(np.abs(among[before] - x) <= np.abs(among[np.minimum(after, last)] - x), before, after).clip(0, last)
+    after = np.searchsorted(among, x).clip(0, last)
+    before = (after - 1).clip(0)
+    return np.where(np.abs(among[before] - x) <= np.abs(among[after] - x), before, after)
 
 
 class _Growing:

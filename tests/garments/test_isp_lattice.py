@@ -55,4 +55,3 @@ def test_interpolated_garment_is_the_surface_map() -> None:
     off = (garment.mesh.vertices[garment.vertex_of_point[inner]] - want).norm(dim=1)
     assert float(off.mean()) < 3e-5
     assert float(off.max()) < 1e-3
-
