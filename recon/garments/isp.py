@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.isp_lattice import Stencils, lattice_stencils
+from recon.garments.isp_lattice import Lattice, lattice
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
@@ -253,8 +253,8 @@ class _Plan:
     """(I,) one representative per distinct inner point that the network is asked about."""
     between: Tensor
     """(J,) one representative per distinct inner point that is interpolated."""
-    lattice: Stencils
-    """Where those J come from, among the I + B."""
+    lattice: Lattice
+    """Where those J come from, among the I."""
     lifted_row: Tensor
     """(P,) row of each point among 2 (I + B + J) lifted positions, front and back of a point beside each other."""
     points_per_vertex: Tensor
@@ -270,7 +270,7 @@ class _Plan:
         keys = np.round((points[inside] + 2) * 2**22).astype(np.int64)
         _, first, which = np.unique(keys[:, 0] * 2**30 + keys[:, 1], return_index=True, return_inverse=True)
         used = np.bincount(which, 1 << panel[inside], len(first)).astype(np.uint8)
-        asked, stencils = lattice_stencils(points[inside[first]], used, resolution)
+        asked, between = lattice(points[inside[first]], used, resolution)
         place = np.empty(len(first), np.int64)
         place[asked] = np.arange(asked.sum())
         place[~asked] = asked.sum() + len(border) + np.arange((~asked).sum())
@@ -292,7 +292,11 @@ class _Plan:
             border_panel=index(panel[border]),
             inner=index(inside[first[asked]]),
             between=index(inside[first[~asked]]),
-            lattice=Stencils(index(place[stencils.nodes]), stencils.weights.to(like)),
+            lattice=Lattice(
+                index(place[between.rows]),
+                *(k.to(like.device) for k in (between.nodes, between.between)),
+                between.weights.to(like),
+            ),
             lifted_row=index(row),
             points_per_vertex=torch.as_tensor(counts, dtype=like.dtype, device=like.device),
             n_vertices=len(counts),

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,22 +18,29 @@ folds that its cubics would miss: 0.01 mm on average at a resolution of 256."""
 
 
 @dataclass(frozen=True)
-class Stencils:
-    """Weighted sums that give the points between from those that the network was asked about."""
+class Lattice:
+    """Points of a fine grid that follow from those that the network was asked about."""
 
+    rows: Tensor
+    """(N,) rows of the lattice's nodes among the points asked about."""
     nodes: Tensor
-    """(J, 16) rows."""
+    """(N,) their place on the lattice, row by row."""
+    between: Tensor
+    """(J,) places of the interpolated points on the fine grid, row by row."""
     weights: Tensor
-    """(J, 16)."""
+    """(R + 1, CELLS + 1) cubics along one axis: the fine grid from the lattice."""
 
     def interpolate(self, values: Tensor) -> Tensor:
-        """Values (N, C) of the points asked about -> (J, C), differentiable in the values."""
-        if not len(self.nodes):
+        """Values (M, C) of the points asked about -> (J, C), differentiable in the values."""
+        if not len(self.between):
             return values[:0]
-        return F.embedding_bag(self.nodes, values, per_sample_weights=self.weights, mode="sum")
+        size, channels = CELLS + 1, values.shape[1]
+        grid = values.new_zeros(size * size, channels).index_copy(0, self.nodes, values[self.rows])
+        down = (self.weights @ grid.view(size, -1)).view(-1, size, channels)
+        return (self.weights @ down).view(-1, channels)[self.between]
 
 
-def lattice_stencils(points: NDArray, used: NDArray[np.uint8], resolution: int) -> tuple[NDArray, Stencils]:
+def lattice(points: NDArray, used: NDArray[np.uint8], resolution: int) -> tuple[NDArray[np.bool_], Lattice]:
     """Which of the distinct inner points (N, 2) to ask the network about, (N,) bool, and how the others follow.
 
     Args:
@@ -42,47 +48,48 @@ def lattice_stencils(points: NDArray, used: NDArray[np.uint8], resolution: int) 
         used: bits of the panels that each belongs to.
         resolution: the grid's cells along the domain's side; 0: ask about all points.
 
-    Nodes of the stencils are indices of ``points``.
+    Rows of the lattice's nodes are indices of ``points``; points between come in their order.
     """
     step = resolution // CELLS
-    none = Stencils(torch.zeros(0, 16, dtype=torch.long), torch.zeros(0, 16))
     if step < 2 or resolution % CELLS:
-        return np.ones(len(points), bool), none
+        none = torch.zeros(0, dtype=torch.long)
+        return np.ones(len(points), bool), Lattice(none, none, none, torch.zeros(0, CELLS + 1))
     place = (points + 1) * (resolution / 2)
     near = np.round(place).astype(np.int64)
     off = np.abs(place - near) > 1e-3
     on_grid = ~(off[:, 0] | off[:, 1])
-    size = resolution + 1 + 4 * step
-    near = near + 2 * step  # stencils may reach over the domain's frame
-    at = np.full((size, size), -1)
-    at[tuple(near[on_grid].T)] = np.nonzero(on_grid)[0]
-    panels = np.zeros((size, size), np.uint8)
-    panels[tuple(near[on_grid].T)] = used[on_grid]
     beside = near % step
-    between = np.nonzero(on_grid & ((beside[:, 0] | beside[:, 1]) > 0))[0]
-    corner = near[between] // step * step
-    between, corner = between[whole := _whole(panels, corner, used[between], step)], corner[whole]
-    reach = step * np.arange(-1, 3)
-    nodes = at[(corner[:, 0, None] + reach)[:, :, None], (corner[:, 1, None] + reach)[:, None]].reshape(-1, 16)
-    asked = np.ones(len(points), bool)
-    asked[between] = False
-    share = cubic_weights((near[between] % step) / step)
-    weights = (share[:, 0, :, None] * share[:, 1, None]).reshape(-1, 16)
-    return asked, Stencils(torch.as_tensor(nodes), torch.as_tensor(weights))
+    node = on_grid & (beside[:, 0] == 0) & (beside[:, 1] == 0)
+    at = near // step
+    panels = np.zeros((CELLS + 1, CELLS + 1), np.uint8)
+    panels[at[node, 0], at[node, 1]] = used[node]
+    between = on_grid & ~node
+    between[between] = (used[between] & ~_whole(panels)[at[between, 0], at[between, 1]]) == 0
+    size = resolution + 1
+    index = [np.nonzero(node)[0], at[node] @ [CELLS + 1, 1], near[between] @ [size, 1]]
+    return ~between, Lattice(*(torch.as_tensor(k) for k in index), torch.as_tensor(cubic_weights(resolution)))
 
 
-def _whole(panels: NDArray, corner: NDArray, used: NDArray, step: int) -> NDArray[np.bool_]:
-    """Whether all 16 nodes around each lattice cell ``corner`` (J, 2) belong to the panels ``used`` (J,)."""
-    common = panels[::step, ::step]
+def _whole(panels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Bits of the panels to which all 16 nodes around each lattice cell belong; cells beyond the frame have none."""
     for axis in (0, 1):
-        before, beyond = np.roll(common, 1, axis), np.roll(common, -1, axis)
-        common = before & common & beyond & np.roll(common, -2, axis)
-    return (used & ~common[corner[:, 0] // step, corner[:, 1] // step]) == 0
+        before, beyond = np.roll(panels, 1, axis), np.roll(panels, -1, axis)
+        panels = before & panels & beyond & np.roll(panels, -2, axis)
+    panels[[0, -2, -1]] = panels[:, [0, -2, -1]] = 0
+    return panels
 
 
-def cubic_weights(t: NDArray) -> NDArray:
-    """(..., 4) Lagrange weights of four equally spaced points for a place t in [0, 1] between the middle two."""
+def cubic_weights(resolution: int) -> NDArray[np.float32]:
+    """(R + 1, CELLS + 1) Lagrange weights of the four lattice points around each grid point, the middle two nearest.
+
+    Towards the frame, where two points are missing on one side, the last four serve.
+    """
+    place = np.arange(resolution + 1) * (CELLS / resolution)
+    first = (place.astype(np.int64) - 1).clip(0, CELLS - 3)
+    t = place - first - 1
     before, after, beyond = t + 1, t - 1, t - 2
-    return np.stack(
-        [-t * after * beyond / 6, before * after * beyond / 2, -before * t * beyond / 2, before * t * after / 6], -1
-    )
+    four = [-t * after * beyond / 6, before * after * beyond / 2, -before * t * beyond / 2, before * t * after / 6]
+    weights = np.zeros((resolution + 1, CELLS + 1), np.float32)
+    for k, share in enumerate(four):
+        weights[np.arange(resolution + 1), first + k] = share
+    return weights
