@@ -23,7 +23,7 @@ from made_scans import OUTFITS, POSES, MadeScan, make_scan
 
 from pipelines.fit_body import to_body
 from pipelines.fit_scan_body import ScanBodyFit, fit_scan_body
-from pipelines.measure import geometry
+from pipelines.measure import by_code, geometry
 from pipelines.models import load_models
 from pipelines.run import Run
 from pipelines.scan import ScanFit, fit_labelled
@@ -67,8 +67,7 @@ def run_case(number: int, config: ScanFit, body_only: bool) -> dict:
         posed = models.body.pose(to_body(values))
         contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
         for layer in layers:
-            truth, rest = made.garments[layer.name], layer.garment.mesh
-            coded = Mesh(models.draper.drape(layer.garment, posed).vertices[0], rest.faces)
+            truth, coded = made.garments[layer.name], by_code(layer, posed, models)
             row["garments"][layer.name] = {
                 "code": float(to_truth(truth, coded).median()),
                 "refined": float(to_truth(truth, meshes[layer.name]).median()),

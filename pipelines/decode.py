@@ -45,7 +45,7 @@ class Decode:
     resolution: int = 256
     """Cells of the cutting grid along the domain's side; 128 = 9-11 mm, 256 = half of that."""
     decoder: str = "isp"
-    """Decoder to use."""
+    """Decoder to use: isp (sewing patterns) or udf (distance fields, without panels)."""
     weights: Path | None = None
     """Folder of your own weights; None = those that ship."""
     code: Path | None = None
@@ -80,6 +80,8 @@ def decode(config: Decode, tick: Callable[[int, float], None] | None = None) -> 
         raise UserError(f"{config.out}: is the evidence; wanted another file to write")
     if config.texture is not None and config.out.suffix.lower() != ".glb":
         raise UserError(f"{config.out}: ends in {config.out.suffix!r}; wanted .glb with --texture")
+    if config.pattern is not None and config.decoder != "isp":
+        raise UserError(f"--pattern: garments of --decoder {config.decoder} have no panels; wanted --decoder isp")
     decoder = load_decoder(config.what[0], config.decoder, folder=config.weights)
     if config.fit is None:
         texture = None if config.texture is None else read_texture(config.texture)
@@ -110,7 +112,7 @@ def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[
     from recon.garments.isp import IspDecoder
 
     if not isinstance(decoder, IspDecoder):
-        raise UserError(f"decoder: found {config.decoder}; --fit wanted isp")
+        raise UserError(f"decoder: found {config.decoder}; --fit wanted isp (recon encode finds codes of udf)")
     evidence = evidence_of(decoder, fit, config.search.seed)
     begun = time.perf_counter()
     starts = evidence.starts(Bank.of(decoder))
@@ -153,7 +155,7 @@ def finish(decoder: GarmentDecoder, latent: Tensor, wanted: Outputs) -> tuple[Ga
     spent = time.perf_counter() - begun
     write_mesh(garment, wanted.out)
     if wanted.code is not None:
-        write_code(wanted.code, decoder.kind, latent)
+        write_code(wanted.code, decoder.kind, latent, decoder.name)
     if wanted.pattern is not None:
         with torch.no_grad():  # coarse outlines are what people can edit
             write_svg(decoder.decode(latent, min(wanted.resolution, PATTERN_RESOLUTION)), wanted.pattern)

@@ -27,7 +27,7 @@ from recon.draping.isp import IspDraper
 from recon.draping.layering import Beneath, Layering, load_layering
 from recon.files.atomic import write_whole
 from recon.files.meshes import Colour, write_glb, write_obj
-from recon.files.weights import read_manifest
+from recon.files.weights import folder_with, read_manifest
 from recon.metrics import beneath_pct, inside_pct, largest_stretch
 from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
 
@@ -47,6 +47,8 @@ class Drape:
     """Folder for the results."""
     draper: str = ""
     """isp, skinning or another of the drapers; "" takes isp for garments with panels and skinning for other meshes."""
+    decoder: str = "isp"
+    """What makes the garments of codes: isp (with panels) or udf (without)."""
     resolution: int = 128
     """Cells of the grid that codes are cut on."""
     layering: bool = True
@@ -85,7 +87,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
 
     at = time.perf_counter()
     body = load_body()
-    things = [load_garment(name, config.resolution) for name in config.garments]
+    things = [load_garment(name, config.resolution, config.decoder, config.weights) for name in config.garments]
     posed = body.pose(_worn_by(config, body))
     timed("load", at)
     at = time.perf_counter()
@@ -174,7 +176,8 @@ def drape_each(
     drapers: dict[str, Draper] = {}
     how: list[str] = []
     drapes: list[Mesh] = []
-    isp = load_draper("isp", body, config.weights) if config.draper in ("", "isp") else None
+    folder = folder_with("drape", config.weights)
+    isp = load_draper("isp", body, folder) if config.draper in ("", "isp") else None
     for name, thing in zip(config.garments, things, strict=True):
         chosen = config.draper
         known = isinstance(isp, IspDraper) and isp.knows(thing)
@@ -182,20 +185,14 @@ def drape_each(
             raise UserError(f"{name}: has no panels that draper isp knows; wanted --draper skinning, or {_PANELLED}")
         chosen = chosen or ("isp" if known else "skinning")
         if chosen not in drapers:
-            drapers[chosen] = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, config.weights)
-        garment = thing if isinstance(thing, Garment) else _bare(thing)
+            drapers[chosen] = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, folder)
+        garment = thing if isinstance(thing, Garment) else Garment.bare("", thing)
         drapes.append(drapers[chosen].drape(garment, posed, under=drapes))
         how.append(chosen)
     return how, drapes
 
 
 _PANELLED = "a garment as KIND:CODE"
-
-
-def _bare(mesh: Mesh) -> Garment:
-    """A mesh without panels in a garment's place, for drapers that only look at the mesh."""
-    none = torch.zeros(0, dtype=torch.long)
-    return Garment("", mesh, torch.zeros(0, 2), none.view(0, 1).expand(0, 3), none, none, none)
 
 
 def measure(

@@ -78,8 +78,8 @@ def encode(config: Encode) -> dict[str, Any]:
     """Encode; returns what was found, and writes it where ``out`` says.
 
     Returns:
-        ``kind``, ``code``, ``distance_mm`` (the mesh's points to the decoded field), ``known`` (well, roughly, hardly),
-        ``nearest`` learned variant, ``up``, ``turned``, ``shift`` [m] and ``notes``; with ``out`` also
+        ``kind``, ``latent``, ``distance_mm`` (the mesh's points to the decoded field), ``known`` (well, roughly,
+        hardly), ``nearest`` learned variant, ``up``, ``turned``, ``shift`` [m] and ``notes``; with ``out`` also
         ``surface_mm``, exact distances between both meshes.
 
     Raises:
@@ -184,7 +184,8 @@ def _report(config: Encode, best: Guess, latent: Tensor, points: Tensor) -> dict
         "kind": kind,
         "family": family_of(kind),
         "kinds": list(FAMILIES[family_of(kind)]),
-        "code": [round(v, 6) for v in latent.tolist()],
+        "decoder": "udf",
+        "latent": [round(v, 6) for v in latent.tolist()],
         "distance_mm": round(distance, 3),
         "usual_mm": usual,
         "known": known,

@@ -74,6 +74,8 @@ class Layer:
     name: str
     garment: Garment
     """Rest pose, welded."""
+    coded: Tensor | None = None
+    """(V, 3) where code and draper alone put it on the body [m]; known from the refine stage on."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,11 @@ class Models:
     """Garment name -> variants of the kind that the name allows."""
     renderer_of: Callable
     """(faces, labels, n_vertices) -> label renderer."""
+
+    @property
+    def skinning(self) -> Draper:
+        """What carries cloth between poses and onto other bodies: the skinning that the draper corrects, or itself."""
+        return getattr(self.draper, "skinning", self.draper)
 
 
 BODY_SIZES = {"shape": 0.01, "pose": 0.006, "translation": 0.003, "log_focal": 0.002, "pitch": 0.002}

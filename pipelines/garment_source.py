@@ -14,17 +14,20 @@ from recon.types import Garment, Mesh, UserError
 FORMS = "KIND:NUMBER, KIND:mean, KIND:random:SEED, KIND:FILE.json, KIND:train:N, KIND:test:N or a mesh file"
 
 
-def load_garment(name: str, resolution: int = 96) -> Garment | Mesh:
+def load_garment(name: str, resolution: int = 96, decoder: str = "isp", weights: Path | None = None) -> Garment | Mesh:
     """The garment that ``name`` names, at rest on the neutral body; a mesh where it has no panels.
 
     Args:
         name: see ``FORMS``.
         resolution: cells of the grid that codes are cut on.
+        decoder: what makes garments of codes: isp or udf.
+        weights: folder of the user's own weights; used where it has the decoder's.
 
     Raises:
         UserError: no such kind, code, garment or file.
     """
-    from recon.garments import KINDS
+    from recon.files.weights import folder_with
+    from recon.garments import KINDS, load_decoder
 
     kind, _, code = name.partition(":")
     if kind not in KINDS or not code:
@@ -38,7 +41,10 @@ def load_garment(name: str, resolution: int = 96) -> Garment | Mesh:
         from recon.garments.dataset import load_garments
 
         return _pick(name, list(load_garments(kind, split)), number)
-    return _decoded(kind, code, resolution)
+    own = folder_with(f"{decoder}-", weights)
+    chosen = load_decoder(kind, decoder, folder=own)
+    with torch.no_grad():
+        return chosen.decode(latent_of(chosen, code), resolution)
 
 
 def _pick(name: str, items: list, number: str):
@@ -65,15 +71,6 @@ def latent_of(decoder: GarmentDecoder, code: str) -> Tensor:
     if Path(code).suffix:
         from recon.files.codes import read_code
 
-        return read_code(code, decoder.kind, decoder.codes.shape[1]).to(decoder.codes)
+        return read_code(code, decoder.kind, decoder.codes.shape[1], decoder.name).to(decoder.codes)
     last = len(decoder.codes) - 1
     raise UserError(f"code: found {code!r}; wanted a number from 0 to {last}, mean, random:SEED or a .json file")
-
-
-def _decoded(kind: str, code: str, resolution: int) -> Garment:
-    from recon.garments import load_decoder
-
-    decoder = load_decoder(kind)
-    latent = latent_of(decoder, code)
-    with torch.no_grad():
-        return decoder.decode(latent, resolution)

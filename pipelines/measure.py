@@ -12,7 +12,7 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stretch
 from recon.cloth.intersections import self_intersections
 from recon.losses import hard_iou
-from recon.types import Mesh, Photo
+from recon.types import Mesh, Photo, PosedBody
 
 
 def overlaps(
@@ -40,12 +40,21 @@ def body_overlap(meshes: dict[str, Mesh], values: dict[str, Tensor], photo: Phot
     return float(hard_iou(image, at.person[None])[0])
 
 
+def by_code(layer: Layer, posed: PosedBody, models: Models) -> Mesh:
+    """Where code and draper alone put a layer: as the refine stage found it, before it graded the cloth."""
+    garment = layer.garment
+    if layer.coded is None:
+        return Mesh(models.draper.drape(garment, posed).vertices[0], garment.mesh.faces)
+    return Mesh(layer.coded, garment.mesh.faces)
+
+
 def geometry(layer: Layer, mesh: Mesh, contact: BodyContact) -> dict[str, float | int]:
     """Counts and strain of one refined layer.
 
     Returns:
         vertices, faces: counts; penetrating_vertices, penetrating_faces: inside the body (faces by their centres);
-        self_intersections: pairs of faces; stretch_p95: 95th percentile of the larger principal stretch (1 = rest).
+        self_intersections: pairs of faces; stretch_p95: 95th percentile of the larger principal stretch (1 = rest: as
+        on the panels, or without panels as graded from the shape at rest).
     """
     with torch.no_grad():
         inside = contact.signed_distance(mesh.vertices) < 0

@@ -39,8 +39,12 @@ class PhotoFit:
     """Body model: anny (embedded) or smpl, smplh, smplx with ``body_file``."""
     body_file: Path | None = None
     """Your own SMPL, SMPL-H or SMPL-X file."""
+    decoder: str = "isp"
+    """What garments are made by: isp (sewing patterns) or udf (distance fields: any surface, but no patterns)."""
+    draper: str = "skinning"
+    """What puts them on the body while codes descend: skinning, isp (garments with panels) or drapenet."""
     weights: Path | None = None
-    """Folder with decoder weights; None takes the shipped ones."""
+    """Folder with decoder weights, and a draper's if it has some; None takes the shipped ones."""
     seed: int = 0
     """Seed of everything random."""
     device: str = "cpu"
@@ -100,6 +104,7 @@ def open_run(config: PhotoFit, masks: dict[str, Tensor] | None, say: Say | None)
         "labels": config.labels,
         "person": config.person,
         "body": [config.body, file_digest(config.body_file) if config.body_file else ""],
+        "models": [config.decoder, config.draper],
         "weights": read_manifest(config.weights),
         "seed": config.seed,
         "device": config.device,

@@ -119,10 +119,13 @@ class Silhouettes:
 
 
 def graded(layers: list[Layer], values: dict[str, Tensor], models: Models) -> list[Layer]:
-    """The layers with panels that fit the person's shape, on the CPU."""
-    unposed = models.body.pose(neutral(to_body(values)))
-    worn = [models.draper.drape(layer.garment, unposed).vertices[0] for layer in layers]
-    cut = [replace(layer, garment=grade(layer.garment, x)) for layer, x in zip(layers, worn)]
+    """The layers with panels that fit the person's shape, and where their codes put them in the pose; on the CPU."""
+    unposed, posed = models.body.pose(neutral(to_body(values))), models.body.pose(to_body(values))
+    cut = []
+    for layer in layers:
+        worn = models.skinning.drape(layer.garment, unposed).vertices[0]
+        coded = models.draper.drape(layer.garment, posed).vertices[0]
+        cut.append(replace(layer, garment=grade(layer.garment, worn), coded=coded))
     return [to_device(layer, torch.device("cpu")) for layer in cut]
 
 
@@ -213,7 +216,7 @@ def refine_with(
         posed = models.body.pose(to_body(values))
         layers = graded(layers, values, models)
     garments = [layer.garment for layer in layers]
-    parts = dress(garments, models.body, to_body(values), models.draper, settings.dressing, tick)
+    parts = dress(garments, models.body, to_body(values), models.skinning, settings.dressing, tick)
     device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
     body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
     evidence = evidence_of(posed, faces)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipelines.fit_garment import Layer
 from pipelines.fit_result import FitResult
 from pipelines.page import (
     PATTERN_NOTE,
@@ -145,6 +146,12 @@ TARGETS: dict[str, tuple[str, str, float | None, bool]] = {
 """Figure -> what to call it, its format, what it should be at least (True) or at most (False)."""
 
 
+NO_PATTERN = (
+    "decoded from a distance field (--decoder udf), which knows a surface but no panels that it could be cut from; "
+    "with --decoder isp there are patterns."
+)
+
+
 def write_report(result: FitResult, pictures: Pictures, config: Any) -> None:
     """Write ``report.html`` to the result's folder; ``config`` is the settings dataclass of the run."""
     figures = result.figures
@@ -164,20 +171,26 @@ def write_report(result: FitResult, pictures: Pictures, config: Any) -> None:
     write_page(result.folder / "report.html", title, sections, figures.get("notes", ()))
 
 
-def mesh_files(names: Sequence[str]) -> list[tuple[str, str]]:
+def mesh_files(layers: Sequence[Layer]) -> list[tuple[str, str]]:
     """(path, what it is) of the meshes and patterns that every fit writes."""
     files = [("scene.glb", "body and garments, named and coloured"), ("body.obj", "the body")]
-    files += [(f"{name}.obj", f"{name}: welded, in metres, texture coordinates = pattern in metres") for name in names]
-    return files + [(f"patterns/{name}.svg", f"{name}: the pieces at true scale") for name in names]
+    for layer in layers:
+        uv = "texture coordinates = pattern in metres" if layer.garment.has_panels else "without texture coordinates"
+        files.append((f"{layer.name}.obj", f"{layer.name}: welded, in metres, {uv}"))
+    cut = [layer.name for layer in layers if layer.garment.has_panels]
+    return files + [(f"patterns/{name}.svg", f"{name}: the pieces at true scale") for name in cut]
 
 
 def common_sections(result: FitResult, config: Any, files: Sequence[tuple[str, str]]) -> list[str]:
     """Sewing patterns, files, times, settings and versions: the end of every report."""
     figures = result.figures
-    patterns = [pattern_svg(layer.garment, layer.name) for layer in result.layers]
+    cut = [layer for layer in result.layers if layer.garment.has_panels]
+    bare = [layer.name for layer in result.layers if not layer.garment.has_panels]
+    drawn = "".join(f"<figure>{pattern_svg(layer.garment, layer.name)}</figure>" for layer in cut)
     return [
-        section("Sewing patterns", "".join(f"<figure>{svg}</figure>" for svg in patterns), PATTERN_NOTE),
-        section("Files", files_list([*mesh_files(list(result.garments)), *files])),
+        *([section("Sewing patterns", drawn, PATTERN_NOTE)] if cut else []),
+        *([section("No sewing patterns", f"<p>{', '.join(bare)}: {NO_PATTERN}</p>")] if bare else []),
+        section("Files", files_list([*mesh_files(result.layers), *files])),
         section("Time", table([(k, f"{v:.1f} s") for k, v in figures["seconds"].items()])),
         section("Settings", table(flat(config)), closed=True),
         section("Versions", table(figures["versions"].items()), closed=True),

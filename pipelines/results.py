@@ -17,7 +17,7 @@ from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size
 from pipelines.fit_result import FitResult
-from pipelines.measure import body_overlap, geometry, overlaps
+from pipelines.measure import body_overlap, by_code, geometry, overlaps
 from pipelines.report import colour_of, write_pictures, write_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
@@ -29,8 +29,9 @@ SCHEMA = 1
 
 
 def header(config) -> dict:
-    """What every ``result.json`` begins with; ``config`` has ``seed`` and ``device``."""
-    return {"schema": SCHEMA, "seed": config.seed, "device": config.device, "versions": versions()}
+    """What every ``result.json`` begins with; ``config``: the settings of a photo's or a scan's fit."""
+    kept = ("decoder", "draper", "seed", "device")
+    return {"schema": SCHEMA, **{name: getattr(config, name) for name in kept}, "versions": versions()}
 
 
 def described(name: str, place: BodyPose) -> dict:
@@ -44,15 +45,25 @@ def described(name: str, place: BodyPose) -> dict:
 
 
 def write_meshes(out: Path, body: Mesh, layers: Sequence[Layer], moved: dict[str, Mesh]) -> None:
-    """``body.obj``, each garment as OBJ and its pattern as SVG, and ``scene.glb`` with all of them."""
+    """``body.obj``, each garment as OBJ, its pattern, where it has one, as SVG, and ``scene.glb`` with all of them."""
     write_obj(body, out / "body.obj", "body")
     parts: dict[str, tuple[Mesh | Garment, Colour]] = {"body": (body, colour_of("body"))}
     for layer in layers:
         garment = replace(layer.garment, mesh=moved[layer.name])
         write_obj(garment, out / f"{layer.name}.obj", layer.name)
-        write_svg(layer.garment, out / "patterns" / f"{layer.name}.svg", layer.name)
+        if layer.garment.has_panels:
+            write_svg(layer.garment, out / "patterns" / f"{layer.name}.svg", layer.name)
         parts[layer.name] = (garment, colour_of(layer.name))
     write_glb(parts, out / "scene.glb")
+
+
+def panel_notes(layers: Sequence[Layer]) -> list[str]:
+    """What a user should know of garments without panels, one line."""
+    bare = [layer.name for layer in layers if not layer.garment.has_panels]
+    if not bare:
+        return []
+    why = "without panels, so no sewing pattern and no texture coordinates; stretch is against the shape at rest"
+    return [f"{', '.join(bare)}: {why}"]
 
 
 def grounded(body: Mesh, meshes: dict[str, Mesh]) -> tuple[Mesh, dict[str, Mesh], Tensor]:
@@ -86,19 +97,16 @@ def measure_all(
     at = level(photo, 512).pick(tuple(layer.name for layer in layers))
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
-        coded = {
-            n: Mesh(models.draper.drape(g, posed).vertices[0], g.mesh.faces)
-            for n, g in ((x.name, x.garment) for x in layers)
-        }
+        coded = {layer.name: by_code(layer, posed, models) for layer in layers}
     contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
-    refined, by_code = overlaps(meshes, values, photo, models, at), overlaps(coded, values, photo, models, at)
+    refined, unrefined = (overlaps(each, values, photo, models, at) for each in (meshes, coded))
     garments = {}
     for layer in layers:
         n = layer.name
         garments[n] = {
             "kind": layer.garment.kind,
             "iou": refined[n],
-            "iou_code_only": by_code[n],
+            "iou_code_only": unrefined[n],
             **geometry(layer, meshes[n], contact),
             "mask_confidence": photo.confidence.get(n),
         }
@@ -124,7 +132,7 @@ def write_results(
         "camera": {"K": camera.K.tolist(), "R": camera.R.tolist(), "t": camera.t.tolist(), "size": list(camera.size)},
         "body_model": described(config.body, place),
         "confidence": photo.confidence,
-        "notes": list(photo.notes),
+        "notes": [*photo.notes, *panel_notes(layers)],
     }
     write_meshes(out, body, layers, moved)
     result = FitResult(out, figures, place, body, tuple(layers), moved, photo=photo, camera=camera)

@@ -44,8 +44,12 @@ class ScanFit:
     """Body model: anny (embedded) or smpl, smplh, smplx with ``body_file``."""
     body_file: Path | None = None
     """Your own SMPL, SMPL-H or SMPL-X file."""
+    decoder: str = "isp"
+    """What garments are made by: isp (sewing patterns) or udf (distance fields: any surface, but no patterns)."""
+    draper: str = "skinning"
+    """What puts them on the body while codes descend: skinning, isp (garments with panels) or drapenet."""
     weights: Path | None = None
-    """Folder with decoder weights; None takes the shipped ones."""
+    """Folder with decoder weights, and a draper's if it has some; None takes the shipped ones."""
     seed: int = 0
     """Seed of everything random."""
     device: str = "cpu"
@@ -107,7 +111,7 @@ def open_run(config: ScanFit, say: Say | None) -> Run:
     identity = {"scan": file_digest(config.scan), "garments": sorted(config.garments)}
     evidence = {
         **{k: file_digest(v) if v and Path(v).is_file() else str(v) for k, v in files.items()},
-        **{k: getattr(config, k) for k in ("values", "unit", "up", "body", "seed", "device")},
+        **{k: getattr(config, k) for k in ("values", "unit", "up", "body", "decoder", "draper", "seed", "device")},
         "named": list(config.garments),
         "weights": read_manifest(config.weights),
     }

@@ -13,8 +13,8 @@ from torch import Tensor
 from pipelines.fit_body import to_body
 from pipelines.fit_garment import Layer, Models
 from pipelines.fit_result import FitResult
-from pipelines.measure import geometry
-from pipelines.results import described, grounded, header, write_meshes
+from pipelines.measure import by_code, geometry
+from pipelines.results import described, grounded, header, panel_notes, write_meshes
 from pipelines.scan_report import HIDDEN, coloured, write_scan_pictures, write_scan_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
@@ -43,7 +43,7 @@ def write_scan_results(config, scan: Scan, models: Models, fitted: Fitted, secon
         "body": body_figures(body, scan),
         "body_model": described(config.body, place),
         "scan": {"points": len(scan.points), "of": {name: len(scan.of(name)) for name in scan.names}},
-        "notes": list(scan.notes),
+        "notes": [*scan.notes, *panel_notes(layers)],
     }
     write_meshes(out, body, layers, moved)
     parts = {name: (mesh, 1e3 * gaps[name], coloured(gaps[name])) for name, mesh in moved.items()}
@@ -83,7 +83,7 @@ def measured(
         out = {}
         for layer in layers:
             name, points = layer.name, scan.of(layer.name)
-            coded = Mesh(models.draper.drape(layer.garment, posed).vertices[0], layer.garment.mesh.faces)
+            coded = by_code(layer, posed, models)
             away = 1e3 * surface_distance(points, meshes[name])[0]
             seen = gaps[name].isfinite()
             out[name] = {

@@ -107,6 +107,7 @@ class Garment:
     """A sewn, welded, open garment mesh in the neutral body's T-pose space, with the panels that it was cut from.
 
     Seam vertices are shared in 3D (one vertex) but have one panel point per panel: hence per-corner panel indices.
+    Garments of distance fields have no panels: theirs are empty, and ``unstrained`` says what the cloth's lengths are.
     """
 
     kind: str
@@ -129,6 +130,19 @@ class Garment:
     """(z,) the code, where it was decoded."""
     variant: str = ""
     """Finer name within the kind (tank, tshirt, shirt, jacket, shorts ...), where known."""
+    unstrained: Tensor | None = None
+    """(V, 3) where a garment without panels is unstrained [m]; None = at rest as it is."""
+
+    @staticmethod
+    def bare(kind: str, mesh: Mesh) -> Garment:
+        """A mesh at rest (V, 3) in a garment's place, without panels; ``kind`` may be ""."""
+        none = torch.zeros(0, dtype=torch.long, device=mesh.faces.device)
+        return Garment(kind, mesh, mesh.vertices.detach().new_zeros(0, 2), none.view(0, 3), none, none, none)
+
+    @property
+    def has_panels(self) -> bool:
+        """Whether it was cut from panels that are known."""
+        return len(self.panel_faces) > 0
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,13 @@ class Cloth:
 
     @classmethod
     def from_garment(cls, garment: Garment, fabric: Fabric | None = None) -> Cloth:
-        """Rest state from the panel points: each triangle lies flat and unstretched in its panel."""
+        """Rest state from the panel points: each triangle lies flat and unstretched in its panel.
+
+        Without panels it is unstretched as it lies at rest. The type of ``panel_points`` is the cloth's, either way.
+        """
+        if not garment.has_panels:
+            at = garment.mesh.vertices if garment.unstrained is None else garment.unstrained
+            return cls.from_mesh(Mesh(at.to(garment.panel_points.dtype), garment.mesh.faces), fabric)
         flat = garment.panel_points.detach()[garment.panel_faces]  # (F, 3, 2)
         flat = torch.where((garment.panel_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
         return cls.from_triangles(garment.mesh.faces, flat, garment.mesh.vertices.shape[-2], fabric)

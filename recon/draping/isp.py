@@ -167,14 +167,16 @@ class IspDraper:
 
     def knows(self, garment: Garment | Mesh) -> bool:
         """Whether it can drape it: a garment with panels, of a kind that it has learned."""
-        return isinstance(garment, Garment) and garment.kind in self.nets
+        return isinstance(garment, Garment) and garment.kind in self.nets and garment.has_panels
 
     def prepare(self, garment: Garment) -> Worn:
         """What only depends on the garment; kept for the last few that carry no gradient.
 
         Raises:
-            UserError: no network for this kind of garment.
+            UserError: no network for this kind of garment, or a garment without panels.
         """
+        if not garment.has_panels:
+            raise UserError("draper isp: found a garment without panels; wanted --draper drapenet or skinning")
         if garment.kind not in self.nets:
             known = ", ".join(self.nets) or "nothing"
             raise UserError(f"draper isp: found a {garment.kind}; it has learned {known}")

@@ -40,20 +40,21 @@ def write_obj(thing: Mesh | Garment, path: str | Path, name: str = "") -> None:
     """Write one named object in metres, y up; vertices stay welded.
 
     A garment's texture coordinates are its panel coordinates in metres, one per corner: the sewing pattern is the UV
-    map. ``name`` defaults to the file's stem. NaN, infinities and bad indices are a ValueError before anything is
-    written.
+    map; one without panels has none. ``name`` defaults to the file's stem. NaN, infinities and bad indices are a
+    ValueError before anything is written.
     """
     path = Path(path)
     name = name or path.stem
     mesh = thing.mesh if isinstance(thing, Garment) else thing
     vertices = finite_vertices(mesh, name)
-    lines = [f"# {name}: metres, y up" + (", vt = panel coordinates in metres" if isinstance(thing, Garment) else "")]
+    panels = isinstance(thing, Garment) and thing.has_panels
+    lines = [f"# {name}: metres, y up" + (", vt = panel coordinates in metres" if panels else "")]
     if isinstance(thing, Garment):
         lines.append(f"{_KIND} {thing.kind}")
     lines.append(f"o {name}")
     lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices.tolist()]
     corners = (mesh.faces.cpu() + 1).tolist()
-    if isinstance(thing, Garment):
+    if isinstance(thing, Garment) and thing.has_panels:
         points = thing.panel_points.detach().cpu()
         if not torch.isfinite(points).all():
             raise ValueError(f"{name}: panel coordinates are NaN or infinite; nothing was written")
@@ -200,7 +201,7 @@ def _read_obj(path: Path) -> tuple[Tensor, Tensor]:
 
 
 def read_garment(path: str | Path) -> Garment | Mesh:
-    """Read a garment with its panels from an OBJ file that ``write_obj`` wrote; a plain mesh from any other.
+    """Read a garment, with its panels where it has some, from an OBJ file of ``write_obj``; a mesh from any other.
 
     Seams have lost their names: border labels are 0 at open edges and 1 ("seam") at seams.
     UserError: as :func:`read_mesh`, or corners without panel coordinates.
@@ -211,6 +212,8 @@ def read_garment(path: str | Path) -> Garment | Mesh:
     kind = next((line.removeprefix(_KIND).strip() for line in lines if line.startswith(_KIND)), "")
     if not kind:
         return mesh
+    if not any(line.startswith("vt ") or (line.startswith("f ") and "/" in line) for line in lines):
+        return Garment.bare(kind, mesh)
     flat = [[float(n) for n in line.split()[1:3]] for line in lines if line.startswith("vt ")]
     corners = [[c.split("/") for c in line.split()[1:]] for line in lines if line.startswith("f ")]
     try:

@@ -80,6 +80,15 @@ def read_manifest(folder: str | Path | None = None) -> dict[str, dict[str, Any]]
     return cards
 
 
+def folder_with(prefix: str, folder: str | Path | None) -> Path | None:
+    """The user's folder, if it lists weights whose names begin so; else None, which stands for those that ship.
+
+    UserError: as :func:`read_manifest`.
+    """
+    own = folder is not None and any(name.startswith(prefix) for name in read_manifest(folder))
+    return Path(folder) if folder is not None and own else None
+
+
 def write_weights(
     name: str,
     tensors: dict[str, Tensor],

@@ -47,6 +47,8 @@ class GarmentDecoder(Protocol):
     """(n, z) learned codes."""
     variants: list[str]
     """The variant of each learned code."""
+    name: str
+    """Key of ``DECODERS``."""
 
     @property
     def kind(self) -> str:

@@ -39,6 +39,8 @@ class Variant:
 class IspDecoder:
     """A ``GarmentDecoder``: codes to garments of one kind."""
 
+    name = "isp"
+
     def __init__(self, nets: IspNets, codes: Tensor, variants: list[Variant]):
         """``codes`` (n, z) learned codes and what each stands for."""
         if len(codes) != len(variants):

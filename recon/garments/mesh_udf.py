@@ -131,8 +131,21 @@ def follow(field: Field, mesh: Mesh, beside: float, frame: Frame | None = None, 
     grown = found - (beside if move else found.detach())
     up, down, beyond = grown.split(sizes)
     vertices = at + ((down - up) / (2 * steep))[:, None] * normal
-    step = torch.where(truly_out, beyond / steep_out, 0.0)
-    return mesh.with_vertices(vertices.index_add(0, rim, -step[:, None] * way))
+    step = -torch.where(truly_out, beyond / steep_out, 0.0)[:, None] * way
+    if move:  # where the surface goes on beyond its old border, the border goes after it
+        step = torch.where(truly_out[:, None], step, (-beyond).clamp_min(0.0)[:, None] * frame.outward)
+    return mesh.with_vertices(vertices.index_add(0, rim, step))
+
+
+def approach(field: Field, mesh: Mesh, beside: float) -> Mesh:
+    """The mesh with vertices that are further than three quarters of ``beside`` [m] from the surface taken onto it.
+
+    As far as that :func:`follow` sees where the surface went; from further away the distance itself says it best.
+    """
+    distance, gradient = slope(field, mesh.vertices)
+    way, steep = _unit(gradient)
+    step = torch.where(distance > 0.75 * beside, distance / steep, 0.0)
+    return mesh.with_vertices(mesh.vertices.detach() - step[:, None] * way)
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:

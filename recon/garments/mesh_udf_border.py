@@ -22,7 +22,7 @@ PEELS = 4
 FOLDED = 0.3
 """Cosine between a face's normal and its neighbours' below which it is folded over."""
 SLIVER = 0.15
-"""Height of a sliver over its longest side [cells]."""
+"""Height of a sliver over its side on the border [cells]."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,13 @@ def trim(field: Field, points: NDArray, faces: NDArray, cutting: Cutting) -> tup
 
 
 def peel(points: NDArray, faces: NDArray, cell: float) -> NDArray[np.int64]:
-    """Faces without those on the border that are slivers or folded over: no direction out of the surface fits them."""
+    """Faces without those on the border that are slivers along it or folded over: no direction out of the surface fits
+    them. Slivers that only end at the border stay: grids make whole columns of them, and each would bare the next.
+    """
     zone, rest = _zone(faces)
     inner = _touched(rest, len(points))
     for _ in range(PEELS):
         area, size = _areas(points, zone)
-        sides = points[zone] - points[np.roll(zone, 1, 1)]
-        height = 2 * size / np.maximum(np.linalg.norm(sides, axis=2).max(1), 1e-12)
         half = np.concatenate([zone[:, [0, 1]], zone[:, [1, 2]], zone[:, [2, 0]]])
         key = half.min(1) * np.int64(len(points)) + half.max(1)
         edge, which, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -109,8 +109,9 @@ def peel(points: NDArray, faces: NDArray, cell: float) -> NDArray[np.int64]:
         sums = np.stack([np.bincount(which.ravel(), np.tile(area[:, k], 3), len(edge)) for k in range(3)], 1)
         around = sums[which].sum(0) - 3 * area  # the neighbours' areas, each once
         agree = (around * area).sum(1) / np.maximum(_length(around) * _length(area), 1e-18)
-        rim = ((count[which] == 1) & ~inner[half].all(1).reshape(3, -1)).any(0)
-        bad = rim & ((agree < FOLDED) | (height < SLIVER * cell))
+        rim = (count[which] == 1) & ~inner[half].all(1).reshape(3, -1)
+        along = np.where(rim, _length(points[half[:, 0]] - points[half[:, 1]]).reshape(3, -1), 0.0).max(0)
+        bad = rim.any(0) & ((agree < FOLDED) | (2 * size < SLIVER * cell * along))
         if not bad.any():
             break
         zone = zone[~bad]
@@ -266,7 +267,8 @@ def outward(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Border vertices (B,) and the unit directions (B, 3) out of the surface there, at right angles to the border.
 
-    edges (E, 2): the border's directed edges, the surface on their left.
+    edges (E, 2): the border's directed edges, the surface on their left. Directions are averaged along the border: in a
+    notch only the neighbours know which way is out.
     """
     rim, index = np.unique(edges, return_inverse=True)
     index = index.reshape(-1, 2)
@@ -274,6 +276,8 @@ def outward(
     for ends in index.T:
         np.add.at(along, ends, points[edges[:, 1]] - points[edges[:, 0]])
     out = np.cross(along, normal[rim])  # faces lie to the left of their edges
+    for _ in range(3):
+        out = _averaged(out, index)
     return rim, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 
@@ -292,9 +296,6 @@ def smooth_borders(field: Field, points: NDArray, faces: NDArray, cutting: Cutti
     for _ in range(cutting.rounds):
         points[rim] = _averaged(_averaged(points[rim], index), index)
         _, way = outward(points, edges, vertex_normals(points, fringe))
-        for _ in range(3):  # in a notch only the neighbours know which way is out
-            way = _averaged(way, index)
-        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
         beyond = points[rim] + cutting.cell * way
         distance, gradient = _slope(field, beyond)
         step = beyond - distance[:, None] * gradient - points[rim]

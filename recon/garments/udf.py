@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.mesh_udf import Frame, Meshing, follow, mesh_udf
+from recon.garments.mesh_udf import Frame, Meshing, approach, follow, mesh_udf
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import CHUNK, Folded, UdfNets, UdfShape
 from recon.types import Garment, Mesh, UserError
@@ -80,6 +80,8 @@ class LatentField:
 class UdfDecoder:
     """A ``GarmentDecoder`` that knows one kind of its family; and an encoder. Its garments have no panels."""
 
+    name = "udf"
+
     def __init__(self, nets: UdfNets, codes: Tensor, known: list[Known], kind: str = ""):
         """``codes`` (n, z) of the whole family, what each stands for, and the kind (default: the first code's)."""
         if len(codes) != len(known):
@@ -129,6 +131,7 @@ class UdfDecoder:
         frame = Frame.of(mesh)
         with torch.no_grad():
             field = self.field(latent.detach())
+            mesh = approach(field, mesh, BESIDE)
             for _ in range(SETTLE):
                 mesh = follow(field, mesh, BESIDE, frame, move=True)
         return replace(garment, mesh=self._following(latent, mesh, frame), latent=latent)
@@ -139,19 +142,8 @@ class UdfDecoder:
         return follow(self.field(latent), mesh, BESIDE, frame)
 
     def _garment(self, latent: Tensor, mesh: Mesh) -> Garment:
-        nothing = torch.zeros(0, dtype=torch.long, device=latent.device)
         nearest = int((self.codes - latent.detach()).square().sum(1).argmin())
-        return Garment(
-            kind=self.kind,
-            mesh=mesh,
-            panel_points=mesh.vertices.new_zeros(0, 2),
-            panel_faces=nothing.view(0, 3),
-            panel_of_face=nothing,
-            vertex_of_point=nothing,
-            border_labels=nothing,
-            latent=latent,
-            variant=self.variants[nearest],
-        )
+        return replace(Garment.bare(self.kind, mesh), latent=latent, variant=self.variants[nearest])
 
     @torch.no_grad()
     def encode(self, points: Tensor) -> Tensor:

@@ -117,3 +117,16 @@ def test_a_shirt_on_a_larger_body() -> None:
     assert strains(shirt, worn)[1] > 1.1
     graded = grade(shirt, worn)
     assert strains(graded, worn)[1] < 1.05
+
+
+def test_without_panels_the_space_is_graded() -> None:
+    """The cubic map that made a bare tube larger is found; its mesh stays, and an even scale is found exactly."""
+    bare = Garment.bare("skirt", PANELS.mesh)
+    x, y, z = bare.mesh.vertices.unbind(1)
+    worn = torch.stack([1.2 * x * (1 + 0.2 * y), 0.95 * y, 1.1 * z], 1)
+    assert strains(bare, worn)[1] > 1.15
+    graded = grade(bare, worn)
+    assert (strains(graded, worn) - 1).abs().max() < 0.02
+    assert graded.mesh is bare.mesh and graded.unstrained is not None and not graded.has_panels
+    even = grade(bare, 1.3 * bare.mesh.vertices)
+    assert (strains(even, 1.3 * bare.mesh.vertices) - 1).abs().max() < 2e-3

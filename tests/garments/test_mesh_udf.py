@@ -14,6 +14,7 @@ from recon.garments.udf_grid import Box, find_band, slope
 from recon.garments.udf_signs import CELL_EDGES, signs
 from recon.metrics import boundary_loops, compare_meshes
 from recon.types import Mesh
+from tests.garments.exact_udf import RADIUS, SHAPE, SLOPE, TubeDecoder
 from tests.garments.fields import cylinder, disc, hemisphere, integral
 from tests.garments.synthetic import tube
 
@@ -40,6 +41,20 @@ def test_borders_lie_where_the_surface_ends(name):
     frame = Frame.of(mesh)
     beyond = make(*sizes)(mesh.vertices[frame.border] + 0.01 * frame.outward)
     assert (beyond - 0.01).abs().median() < 2e-4 and (beyond - 0.01).abs().quantile(0.98) < 2e-3
+
+
+@pytest.mark.parametrize("code", [(0.0, 0.0), (0.2, -0.3), (0.7, 0.6)])
+@pytest.mark.parametrize("resolution", [48, 64])
+def test_along_the_grid_borders_are_as_long_as_they_should_be(code, resolution):
+    """A tube round a grid axis: whole columns of slivers end at its borders, and none may become a slit."""
+    decoder = TubeDecoder()
+    mesh = mesh_udf(decoder.field(torch.tensor(code)), Box(SHAPE.low, SHAPE.high), Meshing(resolution))
+    loops = border_loops(mesh.faces.numpy())
+    assert len(loops) == 2
+    for loop in loops:
+        rim = mesh.vertices[loop]
+        length = (rim - rim.roll(1, 0)).norm(dim=1).sum()
+        assert float(length) == pytest.approx(2 * np.pi * (RADIUS + SLOPE * code[0]), rel=0.02)
 
 
 @pytest.mark.parametrize(("name", "which"), [("disc", 0), ("cylinder", 0), ("cylinder", 1), ("hemisphere", 0)])

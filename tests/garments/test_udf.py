@@ -237,10 +237,12 @@ def test_a_users_mesh_is_read_turned_moved_and_encoded(trained, tmp_path):
     out = tmp_path / "out"
     found = encode(Encode((tmp_path / "a.obj",), "skirt", weights=weights, up="z", refine=5, resolution=48, out=out))
     assert (
-        found["known"] in ("well", "roughly") and abs(abs(found["shift"][0]) - 0.3) < 0.02 and len(found["code"]) == 32
+        found["known"] in ("well", "roughly")
+        and abs(abs(found["shift"][0]) - 0.3) < 0.02
+        and len(found["latent"]) == 32
     )
     assert any("mm" in note for note in found["notes"]) and any("moved" in note for note in found["notes"])
-    assert json.loads((out / "code.json").read_text())["code"] == found["code"] and (out / "decoded.obj").is_file()
+    assert json.loads((out / "code.json").read_text())["latent"] == found["latent"] and (out / "decoded.obj").is_file()
     kept = encode(Encode((tmp_path / "a.obj",), "skirt", weights=weights, up="z", place="keep", refine=0))
     assert kept["distance_mm"] > 2 * found["distance_mm"] and kept["known"] == "hardly"
     with pytest.raises(UserError, match="nothing was overwritten"):
