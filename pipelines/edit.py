@@ -2,7 +2,8 @@
 
 Or with any vector program: ``recon decode top 12 --out a.obj --pattern a.svg``, edit the outlines, then
 ``recon edit top:12 --svg a.svg --out new.obj``. Either way the code is sought whose panels have the edited outline
-(ISP Eq. 12), and the surface map drapes the new panels.
+(ISP Eq. 12), and the surface map drapes the new panels. Garments without panels, of ``--decoder udf``, are edited by
+their codes: ``--attributes length=1`` (see ``edit_attributes``).
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipelines.decode import check, finish
+from pipelines.edit_attributes import extent, read_amounts, with_attributes
 from pipelines.fit_code import CodeFit, find_code
 from pipelines.fit_evidence import PatternEvidence
 from pipelines.garment_source import latent_of
 from pipelines.isp_samples import Outline
 from recon.files.pattern_reading import read_svg
+from recon.garments import load_decoder
 from recon.garments.isp import IspDecoder, load_isp
 from recon.garments.latents import editing_direction
 from recon.garments.outlines import (
@@ -60,6 +63,11 @@ class Edit:
     """Cut it open in front."""
     close: bool = False
     """Close an open front."""
+    attributes: tuple[str, ...] = ()
+    """Without a pattern: more or less of sleeves, length or opening, as in length=-1 opening=1.5; 1 is a standard
+    deviation of what changes in the code."""
+    decoder: str = "isp"
+    """Whose code it is: isp or udf (for ``attributes`` alone: its garments have no pattern)."""
     resolution: int = 256
     """Cells of the cutting grid along the domain's side."""
     code: Path | None = None
@@ -86,6 +94,10 @@ def edit(config: Edit, tick: Callable[[int, float], None] | None = None) -> dict
     _unharmed(config)
     if kind not in LENGTHS:
         raise UserError(f"garment kind: found {kind!r}, wanted one of {', '.join(LENGTHS)}")
+    if config.attributes:
+        return _by_attributes(config, kind, name)
+    if config.decoder != "isp":
+        raise UserError(f"edit: garments of --decoder {config.decoder} have no pattern to edit; wanted --attributes")
     decoder = load_isp(kind, config.weights)
     latent = latent_of(decoder, name)
     wanted = wanted_outline(config, decoder, latent)
@@ -96,6 +108,23 @@ def edit(config: Edit, tick: Callable[[int, float], None] | None = None) -> dict
     spent = time.perf_counter() - begun
     said = finish(decoder, found.latent, config)[1]
     return {**said, **outline_error(decoder, found.latent, wanted), "search_s": round(spent, 1)}
+
+
+def _by_attributes(config: Edit, kind: str, name: str) -> dict:
+    """Edit the code itself; what each attribute's regression found, and the garment's extent before and after [m]."""
+    if config.svg or config.sleeve or config.length or config.open or config.close:
+        raise UserError("edit: found --attributes and an edit of the pattern; wanted one of them")
+    if config.pattern is not None and config.decoder != "isp":
+        raise UserError(f"--pattern: garments of --decoder {config.decoder} have no panels")
+    amounts = read_amounts(config.attributes)
+    decoder = load_decoder(kind, config.decoder, folder=config.weights)
+    latent = latent_of(decoder, name)
+    edited, found = with_attributes(decoder, latent, amounts)
+    with torch.no_grad():
+        before = decoder.decode(latent, config.resolution)
+    garment, said = finish(decoder, edited, config)
+    sizes = {"before": extent(before.mesh.vertices), "after": extent(garment.mesh.vertices)}
+    return {**said, "attributes": found, "extent": sizes}
 
 
 def _unharmed(config: Edit) -> None:

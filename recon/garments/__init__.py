@@ -47,6 +47,8 @@ class GarmentDecoder(Protocol):
     """(n, z) learned codes."""
     variants: list[str]
     """The variant of each learned code."""
+    parameters: list[dict[str, float]]
+    """What the garment of each learned code was cut with, as far as it is known."""
     name: str
     """Key of ``DECODERS``."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,6 +93,15 @@ def test_an_edited_drawing_is_followed(tmp_path):
     assert said["outline_mm"] < 2.5
 
 
+@pytest.mark.parametrize(("amount", "longer"), [("1.2", True), ("-1.2", False)])
+def test_attributes_change_a_code_without_its_pattern(tmp_path, amount, longer):
+    """What tells long skirts from short ones makes a skirt longer or shorter."""
+    said = edit(Edit(("skirt:3",), tmp_path / "a.obj", attributes=(f"length={amount}",), resolution=64))
+    before, after = said["extent"]["before"][1], said["extent"]["after"][1]
+    assert (after > before + 0.01) if longer else (after < before - 0.01)
+    assert said["attributes"]["length"]["accuracy"] > 0.85 and said["open_borders"] == 2
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -104,6 +114,14 @@ def test_an_edited_drawing_is_followed(tmp_path):
         ({"sleeve": 0.5}, "has none"),
         ({"open": True}, "has no open form"),
         ({"close": True}, "closed already"),
+        ({"attributes": ("sleeves=1",)}, "all known garments of kind skirt"),
+        ({"attributes": ("colour=1",)}, "found 'colour=1'; wanted some of sleeves, length, opening"),
+        ({"attributes": ("length=1", "length=2")}, "found twice 'length=2'"),
+        ({"attributes": ("length=long",)}, "wanted a number, as in length=-1"),
+        ({"attributes": ("length=nan",)}, "wanted an amount from -5 to 5"),
+        ({"attributes": ("length=1",), "open": True}, "wanted one of them"),
+        ({"length": 1.1, "decoder": "udf"}, "no pattern to edit; wanted --attributes"),
+        ({"attributes": ("length=1",), "decoder": "udf", "pattern": Path("a.svg")}, "have no panels"),
     ],
 )
 def test_mistakes_are_told_and_write_nothing(tmp_path, change, says):
