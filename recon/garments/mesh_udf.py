@@ -23,6 +23,9 @@ from recon.garments.udf_grid import Box, Field, find_band, slope
 from recon.garments.udf_signs import signs
 from recon.types import Mesh
 
+CHASE = 4
+"""Steps of ``beside`` that a border may go after a surface that grew."""
+
 
 @dataclass(frozen=True)
 class Meshing:
@@ -131,21 +134,36 @@ def follow(field: Field, mesh: Mesh, beside: float, frame: Frame | None = None, 
     grown = found - (beside if move else found.detach())
     up, down, beyond = grown.split(sizes)
     vertices = at + ((down - up) / (2 * steep))[:, None] * normal
-    step = -torch.where(truly_out, beyond / steep_out, 0.0)[:, None] * way
-    if move:  # where the surface goes on beyond its old border, the border goes after it
-        step = torch.where(truly_out[:, None], step, (-beyond).clamp_min(0.0)[:, None] * frame.outward)
-    return mesh.with_vertices(vertices.index_add(0, rim, step))
+    step = torch.where(truly_out, beyond / steep_out, 0.0)
+    return mesh.with_vertices(vertices.index_add(0, rim, -step[:, None] * way))
 
 
-def approach(field: Field, mesh: Mesh, beside: float) -> Mesh:
-    """The mesh with vertices that are further than three quarters of ``beside`` [m] from the surface taken onto it.
+@torch.no_grad()
+def chase(field: Field, before: Field, mesh: Mesh, beside: float, frame: Frame) -> Mesh:
+    """The mesh taken to about where its surface went, as far as :func:`follow` sees the rest of the way.
 
-    As far as that :func:`follow` sees where the surface went; from further away the distance itself says it best.
+    Vertices whose distance grew by more than three quarters of ``beside`` go to what is closest now; borders beyond
+    which the surface now goes on, and did not before, go after it. Comparing with ``before`` leaves alone what a
+    learned field shows anyhow: distances on the surface, and borders that are none.
+
+    Args:
+        field: what it now is.
+        before: what the mesh was made from.
+        mesh: vertices (V, 3) [m].
+        beside: α [m], as in :func:`follow`.
+        frame: of the mesh.
     """
-    distance, gradient = slope(field, mesh.vertices)
+    at, rim = mesh.vertices.detach(), frame.border
+    was_out = before(at[rim] + beside * frame.outward) > 0.5 * beside
+    distance, gradient = slope(field, at)
     way, steep = _unit(gradient)
-    step = torch.where(distance > 0.75 * beside, distance / steep, 0.0)
-    return mesh.with_vertices(mesh.vertices.detach() - step[:, None] * way)
+    left = distance - before(at) > 0.75 * beside
+    at = at - torch.where(left, distance / steep, 0.0)[:, None] * way
+    for _ in range(CHASE):
+        beyond = field(at[rim] + beside * frame.outward)
+        lack = torch.where(was_out & (beyond < 0.5 * beside), beside - beyond, 0.0)
+        at = at.index_add(0, rim, lack[:, None] * frame.outward)
+    return mesh.with_vertices(at)
 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:

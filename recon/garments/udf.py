@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.mesh_udf import Frame, Meshing, approach, follow, mesh_udf
+from recon.garments.mesh_udf import Frame, Meshing, chase, follow, mesh_udf
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import CHUNK, Folded, UdfNets, UdfShape
 from recon.types import Garment, Mesh, UserError
@@ -131,7 +131,8 @@ class UdfDecoder:
         frame = Frame.of(mesh)
         with torch.no_grad():
             field = self.field(latent.detach())
-            mesh = approach(field, mesh, BESIDE)
+            if garment.latent is not None:
+                mesh = chase(field, self.field(garment.latent.detach()), mesh, BESIDE, frame)
             for _ in range(SETTLE):
                 mesh = follow(field, mesh, BESIDE, frame, move=True)
         return replace(garment, mesh=self._following(latent, mesh, frame), latent=latent)
