@@ -17,6 +17,7 @@ import os
 import platform
 import statistics
 import time
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
 from recon.cloth.rest import Resting, rest
-from recon.draping.gaps import GapsNet, GapsShape, load_gaps, motion_features
+from recon.draping.gaps import Bound, GapsDraper, GapsNet, GapsShape, load_gaps
 from recon.files.animations import Moving
 from recon.files.motions import read_clip
 from recon.files.weights import read_manifest
@@ -68,34 +69,26 @@ def table1(
 
 
 def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000) -> dict[str, float]:
-    """Milliseconds a frame of a garment of ``vertices``: one by one and all at once, body posed as well."""
-    net = GapsNet(GapsShape(vertices, body.n_shape)).eval().requires_grad_(False)
+    """Milliseconds a frame of a garment of ``vertices``, skeleton posed as well.
+
+    One by one, without and with the body's own vertices, and all frames at once (with them).
+    """
+    net = GapsNet(GapsShape(vertices, body.n_shape))
     pose = torch.zeros(frames, 24, 3)
     pose[:, 16, 2] = torch.linspace(-1.2, 0, frames)
-    place = torch.zeros(frames, 3)
-    shape = torch.zeros(frames, body.n_shape)
+    whole = BodyPose(torch.zeros(frames, body.n_shape), pose, torch.zeros(frames, 3))
     weights = torch.softmax(torch.randn(vertices, 24), 1)
-    points = torch.rand(vertices, 3)
-    from recon.bodies.skin import skin
-
-    def one_by_one() -> None:
-        hidden, before = None, None
-        for k in range(frames):
-            whole = BodyPose(shape[:1], pose[k : k + 1], place[k : k + 1])
-            posed = body.pose(whole)
-            features = motion_features(pose[None, k : k + 1], place[None, k : k + 1], 30.0, before)
-            moved, hidden = net(features, shape[:1], hidden)
-            skin(points + moved[0], posed.transforms, weights)
-            before = whole.pose, whole.translation
-
-    def at_once() -> None:
-        posed = body.pose(BodyPose(shape, pose, place))
-        moved, _ = net(motion_features(pose[None], place[None], 30.0), shape[:1])
-        skin(points + moved[0], posed.transforms, weights)
-
+    bound = Bound(torch.rand(vertices, 3), weights, torch.zeros(vertices, 3, body.n_shape))
+    draper = GapsDraper(net, Mesh(bound.rest, torch.zeros(0, 3, dtype=torch.long)), bound)
+    each = [whole[k] for k in range(frames)]
+    ways = {
+        "one_by_one": lambda: deque(draper.stream(each, body, 30.0), maxlen=0),
+        "with_body_mesh": lambda: deque(draper.stream((p for p in each if body.pose(p)), body, 30.0), maxlen=0),
+        "at_once": lambda: draper.animate(body.pose(whole), whole, 30.0),
+    }
     figures = {}
     with torch.no_grad():
-        for name, run in (("one_by_one", one_by_one), ("at_once", at_once)):
+        for name, run in ways.items():
             run()
             times = []
             for _ in range(5):

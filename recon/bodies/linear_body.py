@@ -88,15 +88,25 @@ class LinearBody:
         """(B, S) -> (B, 24, 3) T-pose joints [m]."""
         return self.joints + torch.matmul(shape, self.joint_dirs.flatten(0, 1).T).unflatten(-1, (24, 3))
 
+    def skeleton(self, body: BodyPose, rotations: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(B, 24, 4, 4) transforms from rest space to the world and (B, 24, 3) joints: what garments hang on.
+
+        Without the body's own vertices, which take most of ``pose``'s time; ``rotations`` (B, 24, 3, 3) of the pose, if
+        known.
+        """
+        rotations = rotation_matrices(body.pose) if rotations is None else rotations
+        return joint_transforms(rotations, self.rest_joints(body.shape), body.translation)
+
     def pose(self, body: BodyPose) -> PosedBody:
         """Pose the bodies: forward kinematics, then linear blend skinning of the T-pose vertices."""
         self._check(body.pose, "pose", (24, 3))
         self._check(body.translation, "translation", (3,))
         rest = self.rest(body.shape)
-        transforms, posed = joint_transforms(body.pose, self.rest_joints(body.shape), body.translation)
+        rotations = rotation_matrices(body.pose)
+        transforms, posed = self.skeleton(body, rotations)
         vertices = rest.vertices
         if self.pose_dirs is not None:
-            features = rotation_matrices(body.pose[:, 1:]) - torch.eye(3).to(vertices)
+            features = rotations[:, 1:] - torch.eye(3).to(vertices)
             bend = torch.matmul(features.flatten(1), self.pose_dirs.flatten(0, 1).T).unflatten(-1, (-1, 3))
             vertices = vertices + bend
         return PosedBody(

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from recon.bodies.rig import JOINT_NAMES, PARENTS, chain
+from recon.bodies.rig import JOINT_NAMES, PARENTS, chain, rotation_matrices
 from recon.files.motions import Clip
 from recon.types import Motion, UserError
 
@@ -180,7 +180,9 @@ def _placed(clip: Clip, pose: NDArray, body, joints: NDArray) -> NDArray:
         hip, knee, ankle = (joints[JOINT_NAMES.index(n)] for n in ("l_hip", "l_knee", "l_ankle"))
         root *= (np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee)) / max(theirs, 1e-6)
         root -= joints[0]
-    posed = chain(torch.as_tensor(pose), torch.as_tensor(joints)[None].expand(len(pose), -1, -1))[1].numpy()
+    posed = chain(rotation_matrices(torch.as_tensor(pose)), torch.as_tensor(joints)[None].expand(len(pose), -1, -1))[
+        1
+    ].numpy()
     feet = posed[:, FEET, 1].min(1) + root[:, 1]
     root[:, 1] += joints[FEET, 1].min() - np.quantile(feet, 0.02)
     return root - root[0] * [1.0, 0.0, 1.0]

@@ -69,15 +69,15 @@ def _generations(parents: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], ...],
     return rows, tuple(order.index(j) for j in range(len(parents)))
 
 
-def chain(pose: Tensor, joints: Tensor, parents: tuple[int, ...] = PARENTS) -> tuple[Tensor, Tensor]:
+def chain(rotations: Tensor, joints: Tensor, parents: tuple[int, ...] = PARENTS) -> tuple[Tensor, Tensor]:
     """Forward kinematics with world-aligned axes, a generation of joints at a time.
 
-    pose (B, J, 3) local axis-angle, joints (B, J, 3) rest joints -> world rotations (B, J, 3, 3), posed joints
-    (B, J, 3); the first joint stays where the rest body has it.
+    Local rotations (B, J, 3, 3), rest joints (B, J, 3) -> world rotations (B, J, 3, 3), posed joints (B, J, 3); the
+    first joint stays where the rest body has it.
     """
     rows, place = _generations(tuple(parents))
     step = torch.cat([joints[:, :1], joints[:, 1:] - joints[:, list(parents[1:])]], 1)
-    local = torch.cat([rotation_matrices(pose), step[..., None]], -1)  # (B, J, 3, 4)
+    local = torch.cat([rotations, step[..., None]], -1)  # (B, J, 3, 4)
     world = [local[:, list(rows[0])]]
     for above, row in pairwise(rows):
         up = world[-1][:, [above.index(parents[j]) for j in row]]
@@ -87,9 +87,12 @@ def chain(pose: Tensor, joints: Tensor, parents: tuple[int, ...] = PARENTS) -> t
     return whole[..., :3], whole[..., 3]
 
 
-def joint_transforms(pose: Tensor, joints: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """(B, 24, 4, 4) rest space -> world and (B, 24, 3) posed joints, translation (B, 3) included."""
-    world, posed = chain(pose, joints)
+def joint_transforms(rotations: Tensor, joints: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """(B, 24, 4, 4) rest space -> world and (B, 24, 3) posed joints, translation (B, 3) included.
+
+    Of local rotations (B, 24, 3, 3) and rest joints (B, 24, 3).
+    """
+    world, posed = chain(rotations, joints)
     posed = posed + translation[:, None]
     offset = posed - (world @ joints[..., None])[..., 0]
     top = torch.cat([world, offset[..., None]], -1)

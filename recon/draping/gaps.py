@@ -7,7 +7,7 @@ gravity and velocities are given in the pelvis' own frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ import torch
 from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 
+from recon.bodies import Body
 from recon.bodies.rig import rotation_matrices
 from recon.bodies.skin import skin
 from recon.draping.binding import METHODS, BodyField, cloth_operators
@@ -112,18 +113,25 @@ def motion_features(
         fps: frames per second.
         before: pose (B, 24, 3) and translation (B, 3) of the frame before the first; without, the first stands still.
     """
-    world = rotation_matrices(pose[:, :, 0])
-    joints = rotation_matrices(pose[:, :, 1:])[..., :2].flatten(-3)
-    if before is None:
-        before = pose[:, 0], translation[:, 0]
-    earlier = torch.cat([before[1][:, None], translation[:, :-1]], 1)
-    turned = torch.cat([rotation_matrices(before[0][:, None, 0]), world[:, :-1]], 1)
+    earlier = None if before is None else (rotation_matrices(before[0][:, 0]), before[1])
+    return features_of(rotation_matrices(pose), translation, fps, earlier)
+
+
+def features_of(
+    rotations: Tensor, translation: Tensor, fps: float, before: tuple[Tensor, Tensor] | None = None
+) -> Tensor:
+    """The same from local rotations (B, T, 24, 3, 3); ``before``: the pelvis' rotation (B, 3, 3) and place (B, 3)."""
+    world, joints = rotations[:, :, 0], rotations[:, :, 1:, :, :2].flatten(-3)
+    turned, earlier = world[:, :1], translation[:, :1]
+    if before is not None:
+        turned, earlier = before[0][:, None], before[1][:, None]
+    if world.shape[1] > 1:
+        turned, earlier = torch.cat([turned, world[:, :-1]], 1), torch.cat([earlier, translation[:, :-1]], 1)
     to_own = world.transpose(-1, -2)
-    velocity = (to_own @ ((translation - earlier) * fps)[..., None])[..., 0]
+    velocity = (to_own @ ((translation - earlier) * (fps * SPEED))[..., None])[..., 0]
     turn = to_own @ turned  # from this frame's axes to the last one's
-    skew = (turn.transpose(-1, -2) - turn) / 2
-    spin = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1) * fps
-    return torch.cat([joints, to_own[..., 1], velocity * SPEED, spin * SPEED], -1)
+    skew = (turn.transpose(-1, -2) - turn).flatten(-2)[..., [7, 2, 3]]  # entries (2, 1), (0, 2), (1, 0)
+    return torch.cat([joints, to_own[..., 1], velocity, skew * (fps * SPEED / 2)], -1)
 
 
 @dataclass(frozen=True)
@@ -146,8 +154,11 @@ class Bound:
 
     def place(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
         """Displacements (B, V, 3), joint transforms (B, 24, 4, 4), shapes (B, S) -> posed vertices (B, V, 3)."""
-        shaped = self.rest + torch.einsum("vds,bs->bvd", self.directions, shape) + moved
-        return skin(shaped, transforms, self.weights)
+        return skin(self.shaped(shape) + moved, transforms, self.weights)
+
+    def shaped(self, shape: Tensor) -> Tensor:
+        """The template as wide as bodies of shape (B, S): (B, V, 3) [m]."""
+        return self.rest + torch.einsum("vds,bs->bvd", self.directions, shape)
 
 
 class GapsDraper:
@@ -156,6 +167,8 @@ class GapsDraper:
     def __init__(self, net: GapsNet, garment: Garment | Mesh, bound: Bound):
         """``garment``: the template, a mesh where it has no panels."""
         self.net = net.eval().requires_grad_(False)
+        last = self.net.out  # by columns in memory: one frame's product takes half the time
+        last.weight = nn.Parameter(last.weight.T.contiguous().T, requires_grad=False)
         self.garment, self.bound = garment, bound
 
     @torch.no_grad()
@@ -166,16 +179,19 @@ class GapsDraper:
         return self.bound.place(moved[0], body.transforms, pose.shape)
 
     @torch.no_grad()
-    def stream(self, frames: Iterator[tuple[PosedBody, BodyPose]], fps: float) -> Iterator[Tensor]:
-        """One frame after another, each (1, V, 3) [m], as they come."""
-        hidden, before = None, None
-        for body, pose in frames:
-            features = motion_features(pose.pose[None], pose.translation[None], fps, before)
+    def stream(self, frames: Iterable[BodyPose], body: Body, fps: float) -> Iterator[Tensor]:
+        """One frame after another, each (1, V, 3) [m], as they come; of the body only its skeleton is posed."""
+        hidden, before, shape, shaped = None, None, None, None
+        for pose in frames:
+            rotations = rotation_matrices(pose.pose)
+            features = features_of(rotations[None], pose.translation[None], fps, before)
+            if shape is None or not torch.equal(pose.shape, shape):
+                shape, shaped = pose.shape, self.bound.shaped(pose.shape)
             if hidden is None:
-                hidden = self._warm(features, pose.shape)
-            moved, hidden = self.net(features, pose.shape, hidden)
-            before = pose.pose, pose.translation
-            yield self.bound.place(moved[0], body.transforms, pose.shape)
+                hidden = self._warm(features, shape)
+            moved, hidden = self.net(features, shape, hidden)
+            before = rotations[:, 0], pose.translation
+            yield skin(shaped + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
         """The hidden state of a body that has stood still in its first pose."""

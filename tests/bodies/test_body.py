@@ -161,7 +161,7 @@ def test_rotations(exact):
         x = torch.full((2, 3), scale, dtype=torch.float64, requires_grad=True)
         assert torch.autograd.gradcheck(rotation_matrices, (x,))
     zero = torch.zeros(1, 24, 3, requires_grad=True)
-    rotations, joints = chain(zero, torch.randn(1, 24, 3))
+    rotations, joints = chain(rotation_matrices(zero), torch.randn(1, 24, 3))
     (grad,) = torch.autograd.grad(joints.sum() + rotations.sum(), zero)
     assert torch.isfinite(grad).all() and grad.abs().max() > 0
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.bodies import load_body
 from recon.bodies.retarget import mirrored, motion_of, resampled, retarget
-from recon.bodies.rig import JOINT_NAMES, chain
+from recon.bodies.rig import JOINT_NAMES, chain, rotation_matrices
 from recon.files.motions import Clip
 from recon.types import Motion, UserError
 
@@ -53,7 +53,7 @@ def joints(body) -> np.ndarray:
 def test_limbs_point_where_the_clips_do(joints: np.ndarray) -> None:
     made = clip(random_local(5))
     pose = retarget(made, joints)
-    posed = chain(torch.as_tensor(pose), torch.as_tensor(joints)[None].expand(5, -1, -1))[1].numpy()
+    posed = chain(rotation_matrices(torch.as_tensor(pose)), torch.as_tensor(joints)[None].expand(5, -1, -1))[1].numpy()
     at = made.names.index
     for side, prefix in (("l_", "Left"), ("r_", "Right")):
         for ours, end, theirs, child in (

@@ -109,8 +109,7 @@ def test_streaming_is_the_same_as_all_at_once(trained, body) -> None:
     whole = BodyPose(torch.zeros(FRAMES, body.n_shape), pose[0], place[0])
     with torch.no_grad():
         posed = body.pose(whole)
-        frames = ((body.pose(whole[k]), whole[k]) for k in range(FRAMES))
-        one_by_one = torch.cat(list(draper.stream(frames, 30.0)))
+        one_by_one = torch.cat(list(draper.stream((whole[k] for k in range(FRAMES)), body, 30.0)))
     torch.testing.assert_close(one_by_one, draper.animate(posed, whole, 30.0), atol=1e-5, rtol=1e-4)
 
 
