@@ -128,7 +128,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     a, b = (torch.tensor(side) for side in zip(*BONES))
     seen = (points @ camera.R.T) * points.new_tensor([1.0, -1.0, -1.0])  # y up before the camera, as the guess is
     share = (trust / trust.sum().clamp_min(1e-6))[:, None]
-    about = [x - (share * x).sum(0) for x in (seen, photo.landmarks_world)]
+    places, guess = (x - (share * x).sum(0) for x in (seen, photo.landmarks_world))
     ours, theirs = seen[b] - seen[a], photo.landmarks_world[b] - photo.landmarks_world[a]
     sure = torch.minimum(trust[a], trust[b])
     aligned = 1 - torch.cosine_similarity(ours, theirs, dim=-1)
@@ -140,7 +140,7 @@ def evidence_loss(values: dict[str, Tensor], posed: PosedBody, body, photo: Phot
     return (
         settings.landmarks * close
         + settings.bones * bones
-        + settings.places * robust_distance(*about, trust, 0.1)
+        + settings.places * robust_distance(places, guess, trust, 0.1)
         + settings.size * size
         + settings.prior * pose_prior(values["pose"]).mean()
         + settings.straight * (values["pose"][:, KNEES, 0] / 0.3).square().mean()

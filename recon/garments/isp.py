@@ -14,7 +14,7 @@ from recon.garments.isp_lattice import Lattice, lattice
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
-from recon.types import Garment, Mesh, UserError
+from recon.types import Garment, Mesh, UserError, to_device
 
 COARSE = (32, 128)
 """Cells of the coarser grids along each axis."""
@@ -294,11 +294,7 @@ class _Plan:
             border_panel=index(panel[border]),
             inner=index(inside[first[asked]]),
             between=index(inside[first[~asked]]),
-            lattice=Lattice(
-                index(place[between.rows]),
-                *(k.to(like.device) for k in (between.nodes, between.between)),
-                between.weights.to(like),
-            ),
+            lattice=replace(to_device(between, like.device), rows=index(place[between.rows])),
             lifted_row=index(row),
             points_per_vertex=torch.as_tensor(counts, dtype=like.dtype, device=like.device),
             n_vertices=len(counts),

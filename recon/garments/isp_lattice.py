@@ -36,8 +36,9 @@ class Lattice:
             return values[:0]
         size, channels = CELLS + 1, values.shape[1]
         grid = values.new_zeros(size * size, channels).index_copy(0, self.nodes, values[self.rows])
-        down = (self.weights @ grid.view(size, -1)).view(-1, size, channels)
-        return (self.weights @ down).view(-1, channels)[self.between]
+        weights = self.weights.to(values.dtype)
+        down = (weights @ grid.view(size, -1)).view(-1, size, channels)
+        return (weights @ down).view(-1, channels)[self.between]
 
 
 def lattice(points: NDArray, used: NDArray[np.uint8], resolution: int) -> tuple[NDArray[np.bool_], Lattice]:
@@ -66,8 +67,10 @@ def lattice(points: NDArray, used: NDArray[np.uint8], resolution: int) -> tuple[
     between = on_grid & ~node
     between[between] = (used[between] & ~_whole(panels)[at[between, 0], at[between, 1]]) == 0
     size = resolution + 1
-    index = [np.nonzero(node)[0], at[node] @ [CELLS + 1, 1], near[between] @ [size, 1]]
-    return ~between, Lattice(*(torch.as_tensor(k) for k in index), torch.as_tensor(cubic_weights(resolution)))
+    nodes, fine = at[node] @ [CELLS + 1, 1], near[between] @ [size, 1]
+    weights = torch.as_tensor(cubic_weights(resolution))
+    rows = torch.as_tensor(np.nonzero(node)[0])
+    return ~between, Lattice(rows, torch.as_tensor(nodes), torch.as_tensor(fine), weights)
 
 
 def _whole(panels: NDArray[np.uint8]) -> NDArray[np.uint8]:
