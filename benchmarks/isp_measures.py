@@ -104,7 +104,7 @@ def silhouette(decoder: IspDecoder, garment: Garment) -> Tensor:
 def fits(kind: str, source: str, count: int, search: CodeFit) -> Iterator[dict]:
     """One row for each of the first unseen garments of a kind."""
     decoder = load_isp(kind)
-    bank = Bank.of(decoder) if source != "pattern" else None
+    bank = Bank(decoder) if source != "pattern" else None
     for number, item in enumerate(load_items(kind, "test")[:count]):
         begun = time.perf_counter()
         latent = code_of(decoder, item.garment, source, bank, search)

@@ -71,7 +71,7 @@ def fits(choice: Sequence[tuple[str, int]]) -> NDArray:
     rows = []
     for kind, number in choice:
         decoder, truth = load_isp(kind), load_garments(kind, "test")[number]
-        bank, found = Bank.of(decoder), [truth]
+        bank, found = Bank(decoder), [truth]
         for source in SOURCES:
             latent = code_of(decoder, truth, source, bank, CodeFit())
             with torch.no_grad():

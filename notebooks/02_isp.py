@@ -92,7 +92,7 @@ skirts = load_isp("skirt")
 truth = load_garments("skirt", "test")[2]
 pattern = PatternEvidence.of(skirts, truth)
 points = SurfaceEvidence(skirts, sample_surface(truth.mesh, 300, torch.Generator().manual_seed(0))[0])
-starts = {"pattern": pattern.starts(), "points": points.starts(Bank.of(skirts, 4 if QUICK else 40))}
+starts = {"pattern": pattern.starts(), "points": points.starts(Bank(skirts, 4 if QUICK else 40))}
 found = []
 for name, evidence in (("pattern", pattern), ("points", points)):
     latent = find_code(skirts, evidence, skirts.codes[starts[name]], search).latent

@@ -115,7 +115,7 @@ def _fitted(config: Decode, decoder: GarmentDecoder, fit: Path, tick: Callable[[
         raise UserError(f"decoder: found {config.decoder}; --fit wanted isp (recon encode finds codes of udf)")
     evidence = evidence_of(decoder, fit, config.search.seed)
     begun = time.perf_counter()
-    starts = evidence.starts(Bank.of(decoder))
+    starts = evidence.starts(Bank(decoder))
     found = find_code(decoder, evidence, decoder.codes[starts], config.search, tick)
     spent = time.perf_counter() - begun
     said = finish(decoder, found.latent, config)[1]

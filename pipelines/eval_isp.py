@@ -32,7 +32,7 @@ def evaluate(
     pairs = {"seen": [(decoder.codes[k], g) for k, g in enumerate(seen)]}
     if unseen:
         pairs["unseen_from_pattern"] = [(fit_pattern(decoder, g, seed), g) for g in unseen]
-        bank = Bank.of(decoder)
+        bank = Bank(decoder)
         pairs["unseen_from_mesh"] = [(fit_surface(decoder, g.mesh, bank, seed), g) for g in unseen[:FROM_MESH]]
     result: dict[str, dict[str, float]] = {}
     for name, group in pairs.items():

@@ -6,7 +6,7 @@ All energies are in about the same unit, 4 x the mean misfit over half the domai
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from pipelines.codes import retrieved
 from pipelines.isp_samples import Border, Outline, on_border, panel_border, signed_distance
 from recon.bodies import load_body
 from recon.cloth.contact import BodyContact
@@ -22,7 +23,6 @@ from recon.files.masks import read_mask
 from recon.files.meshes import read_mesh
 from recon.files.points import read_points
 from recon.garments.isp import IspDecoder
-from recon.garments.latents import spread
 from recon.garments.panels import border_edges
 from recon.losses import chamfer_pull, hard_iou, outside_distance, soft_iou_loss
 from recon.metrics import boundary_loops, sample_surface, surface_distance
@@ -81,23 +81,26 @@ class PatternEvidence:
         return energies.topk(min(CANDIDATES, len(energies)), largest=False).indices.tolist()
 
 
-@dataclass(frozen=True)
 class Bank:
-    """Learned garments that cover the code space, to choose starts from."""
+    """Learned garments to choose starts from, decoded coarsely when they are first asked for."""
 
-    indices: list[int]
-    garments: list[Garment]
+    def __init__(self, decoder: IspDecoder, count: int = 40):
+        """``count`` codes that cover the learned ones are compared first, then their best ones' neighbours."""
+        self.decoder, self.count = decoder, count
+        self._kept: dict[int, Garment] = {}
 
-    @staticmethod
-    def of(decoder: IspDecoder, count: int = 40) -> Bank:
-        """``count`` learned codes, decoded coarsely."""
-        indices = spread(decoder.codes, count).tolist()
-        with torch.no_grad():
-            return Bank(indices, [decoder.decode(decoder.codes[k], BANK_RESOLUTION) for k in indices])
+    def __getitem__(self, index: int) -> Garment:
+        """The garment of a learned code."""
+        if index not in self._kept:
+            with torch.no_grad():
+                self._kept[index] = self.decoder.decode(self.decoder.codes[index], BANK_RESOLUTION)
+        return self._kept[index]
 
-    def best(self, scores: list[float]) -> list[int]:
-        """The codes of least score, best first."""
-        return [self.indices[k] for k in np.argsort(scores)[:CANDIDATES].tolist()]
+    def best(self, score: Callable[[Garment], float]) -> list[int]:
+        """Learned codes by the score of their garments, best first; 1 is a perfect score."""
+        everyone = torch.arange(len(self.decoder.codes))
+        found = retrieved(self.decoder.codes, everyone, lambda index: score(self[index]), self.count)
+        return found[:CANDIDATES].tolist()
 
 
 class SurfaceEvidence:
@@ -111,6 +114,7 @@ class SurfaceEvidence:
         self.decoder, self.resolution = decoder, resolution
         self.half = decoder.nets.shape.half
         self.mesh = target if isinstance(target, Mesh) else None
+        self.loops = boundary_loops(target.faces) if isinstance(target, Mesh) else None
         if isinstance(target, Mesh):
             self.points = sample_surface(target, count, generator)[0]
             self.contact = BodyContact(target.vertices, target.faces)
@@ -165,20 +169,17 @@ class SurfaceEvidence:
 
     def starts(self, bank: Bank) -> list[int]:
         """Learned codes whose garments are closest, best first; those with another number of open borders come last."""
-        wanted = boundary_loops(self.mesh.faces) if self.mesh is not None else None
-        scores = []
-        for garment in bank.garments:
-            x = garment.mesh.vertices
-            forth = cKDTree(x.numpy()).query(self.points.numpy())[0].mean()
-            back = cKDTree(self.points.numpy()).query(x.numpy())[0].mean()
-            other = wanted is not None and boundary_loops(garment.mesh.faces) != wanted
-            score = float(forth + back) + 0.1 * other
-            if len(self.border):
-                own = border_points(x, garment.mesh.faces).numpy()
-                score += float(cKDTree(own).query(self.border.numpy())[0].mean())
-                score += float(cKDTree(self.border.numpy()).query(own)[0].mean())
-            scores.append(score)
-        return bank.best(scores)
+        return bank.best(self._score)
+
+    def _score(self, garment: Garment) -> float:
+        """1 less the distances both ways, those of the borders too [m], and less 0.1 where borders do not agree."""
+        pairs = [(garment.mesh.vertices.numpy(), self.points.numpy())]
+        if len(self.border):
+            own = border_points(garment.mesh.vertices, garment.mesh.faces)
+            pairs.append((own.numpy(), self.border.numpy()))
+        off = sum(cKDTree(a).query(b)[0].mean() + cKDTree(b).query(a)[0].mean() for a, b in pairs)
+        other = self.loops is not None and boundary_loops(garment.mesh.faces) != self.loops
+        return 1.0 - float(off) - 0.1 * other
 
 
 def border_points(x: Tensor, faces: Tensor, pieces: int = 4) -> Tensor:
@@ -248,13 +249,14 @@ class SilhouetteEvidence:
 
     def starts(self, bank: Bank) -> list[int]:
         """Learned codes whose silhouettes overlap most, best first."""
-        scores = []
-        for garment in bank.garments:
-            self.take(garment)
-            with torch.no_grad():
-                image = self.image(garment.mesh.vertices)
-            scores.append(-float(hard_iou(image[None], self.target[None])[0]))
-        return bank.best(scores)
+        return bank.best(self._score)
+
+    def _score(self, garment: Garment) -> float:
+        """Overlap of the garment's silhouette with the mask."""
+        self.take(garment)
+        with torch.no_grad():
+            image = self.image(garment.mesh.vertices)
+        return float(hard_iou(image[None], self.target[None])[0])
 
 
 def evidence_of(decoder: IspDecoder, path: Path, seed: int = 0) -> SurfaceEvidence | SilhouetteEvidence:

@@ -9,6 +9,7 @@ import torch
 from pipelines.decode import Decode, decode
 from pipelines.fit_code import CodeFit, Sewable, find_code
 from pipelines.fit_evidence import (
+    CANDIDATES,
     Bank,
     PatternEvidence,
     SilhouetteEvidence,
@@ -20,7 +21,7 @@ from pipelines.fit_evidence import (
 from recon.files.meshes import write_ply
 from recon.garments import load_decoder
 from recon.garments.dataset import load_garments
-from recon.garments.latents import LatentPrior, nearest
+from recon.garments.latents import LatentPrior, nearest, spread
 from recon.metrics import panel_iou, sample_surface, surface_distance
 from recon.types import UserError
 
@@ -69,10 +70,33 @@ def test_a_surface_leads_closer(decoder, pair, sparse):
     assert off(found.latent) < 0.7 * off(decoder.codes[start])
 
 
-def test_starts_are_the_closest_garments_with_as_many_borders(decoder, pair):
-    with torch.no_grad():
-        bank = Bank([9, 3, 7], [decoder.decode(decoder.codes[k], 40) for k in (9, 3, 7)])
-    assert SurfaceEvidence(decoder, pair[0].mesh, 40, 200).starts(bank)[0] == 3
+@pytest.fixture(scope="module")
+def bank(decoder):
+    return Bank(decoder, 24)
+
+
+@pytest.mark.parametrize("source", ["mesh", "points", "silhouette"])
+def test_starts_are_the_closest_learned_garments(decoder, pair, bank, source):
+    """Also one that the first round does not look at: the second looks at its neighbours."""
+    truth = pair[0]
+    evidence: SurfaceEvidence | SilhouetteEvidence
+    if source == "silhouette":
+        drawn = SilhouetteEvidence(decoder, torch.eye(96, 72), front_camera((96, 72)), 96, 40)
+        drawn.take(truth)
+        evidence = SilhouetteEvidence(decoder, drawn.image(truth.mesh.vertices), drawn.camera, 96, 40)
+    else:
+        evidence = SurfaceEvidence(decoder, truth.mesh if source == "mesh" else truth.mesh.vertices, 40, 200)
+    first = spread(decoder.codes, bank.count).tolist()
+    found = evidence.starts(bank)
+    assert len(set(found)) == CANDIDATES
+    assert evidence._score(bank[found[0]]) > max(evidence._score(bank[k]) for k in first)
+
+
+def test_starts_with_other_openings_come_last(decoder, pair, bank):
+    evidence = SurfaceEvidence(decoder, pair[0].mesh, 40, 200)
+    same = evidence._score(pair[0])
+    evidence.loops = 3
+    assert evidence._score(pair[0]) == pytest.approx(same - 0.1)
 
 
 def test_gradients_of_surface_evidence(decoder, unseen):
@@ -115,9 +139,7 @@ def test_border_points_lie_on_the_border(unseen):
 
 
 def test_the_command_finds_a_code(tmp_path, unseen, monkeypatch):
-    monkeypatch.setattr(
-        "pipelines.fit_evidence.Bank.of", staticmethod(lambda d, count=4: Bank([0], [d.decode(d.codes[0], 40)]))
-    )
+    monkeypatch.setattr("pipelines.fit_evidence.retrieved", lambda codes, *rest: torch.tensor([0]))
     write_ply(unseen.mesh, tmp_path / "scan.ply")
     seen = []
     said = decode(
