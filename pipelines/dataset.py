@@ -34,6 +34,8 @@ class DatasetMake:
     """Trousers and shorts to train on."""
     dresses: int = 100
     """Dresses to train on."""
+    shirts6: int = 0
+    """Shirts of six panels to train on."""
     test: int = 20
     """Further garments of each kind, from other seeds, never to be trained on."""
     processes: int = 0
@@ -64,6 +66,7 @@ class Job:
 def jobs(config: DatasetMake) -> list[Job]:
     """All garments, kinds and splits interleaved: whenever it is stopped, a balanced set exists; tests come early."""
     counts = {"top": config.tops, "skirt": config.skirts, "trousers": config.trousers, "dress": config.dresses}
+    counts |= {"shirt6": config.shirts6} if config.shirts6 else {}
     ordered: list[tuple[float, int, Job]] = []
     for kind, count in counts.items():
         for split, total in (("train", count), ("test", config.test)):

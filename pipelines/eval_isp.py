@@ -10,7 +10,7 @@ from pipelines.fit_code import CodeFit, find_code
 from pipelines.fit_evidence import Bank, PatternEvidence, SurfaceEvidence
 from pipelines.isp_samples import along, panel_border, signed_distance
 from recon.garments.isp import IspDecoder
-from recon.garments.sewing import is_manifold
+from recon.garments.sewing import is_manifold, sewn_to
 from recon.metrics import boundary_loops, compare_meshes, largest_stretch, panel_iou
 from recon.types import Garment, Mesh, UserError
 
@@ -66,7 +66,7 @@ def measure(decoder: IspDecoder, latent: Tensor, truth: Garment, generator: torc
 def label_accuracy(decoder: IspDecoder, latent: Tensor, truth: Garment, count: int = 1000) -> float:
     """Share of the truth's border points whose label the pattern network finds."""
     rng, right = np.random.default_rng(0), []
-    for panel in (0, 1):
+    for panel in range(decoder.panels):
         border = panel_border(truth, decoder.nets.shape, panel)
         at = along(border, rng, count)[0]
         label = signed_distance(border, at)[1]
@@ -77,18 +77,13 @@ def label_accuracy(decoder: IspDecoder, latent: Tensor, truth: Garment, count: i
 
 def seam_gap(decoder: IspDecoder, garment: Garment) -> Tensor:
     """(S,) distances [m] between the two sides of each seam point before they are welded."""
-    seam = (garment.border_labels > 0).nonzero()[:, 0]
-    panel = torch.zeros(len(garment.panel_points), dtype=torch.long)
-    panel[garment.panel_faces[garment.panel_of_face == 1]] = 1
     assert garment.latent is not None
-    lifted = decoder.surface(garment.latent.detach(), garment.panel_points[seam])
-    own = lifted[torch.arange(len(seam)), panel[seam]]
-    front, back = panel[seam] == 0, panel[seam] == 1
-    vertex = garment.vertex_of_point[seam]
-    place = torch.full((len(garment.mesh.vertices), 3), torch.nan)
-    place[vertex[back]] = own[back]
-    gap = (place[vertex[front]] - own[front]).norm(dim=1)
-    return gap[gap.isfinite()]
+    one = torch.arange(len(garment.panel_points))
+    other = torch.as_tensor(sewn_to(garment.vertex_of_point.numpy()))
+    both = torch.stack([one, other], 1)[other > one]
+    lifted = decoder.surface(garment.latent.detach(), garment.panel_points[both].flatten(0, 1))
+    own = lifted[torch.arange(len(lifted)), garment.panel_of_point[both].flatten()].unflatten(0, (-1, 2))
+    return (own[:, 0] - own[:, 1]).norm(dim=1)
 
 
 def fit_pattern(decoder: IspDecoder, truth: Garment, seed: int = 0) -> Tensor:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from recon.garments.isp import IspDecoder
 from recon.garments.latents import LatentPrior
+from recon.garments.sewing import sewn_to
 from recon.types import Garment, UserError
 
 HOPELESS = 1e3
@@ -74,7 +75,7 @@ class Sewable:
         self.places, self.seams = places, seams
         self.generator = torch.Generator().manual_seed(settings.seed)
         self.inside = self.seam = torch.zeros(0, 2)
-        self.panel = torch.zeros(0, dtype=torch.long)
+        self.panel = self.seam_panels = torch.zeros(0, dtype=torch.long)
 
     def renew(self, garment: Garment) -> None:
         """Take the points to look at from a garment near the code: within panels, and along seams."""
@@ -86,6 +87,8 @@ class Sewable:
         sewn = (garment.border_labels > 0).nonzero()[:, 0]
         some = torch.randint(max(len(sewn), 1), (self.seams if len(sewn) else 0,), generator=self.generator)
         self.seam = points[sewn[some]]
+        partner = torch.as_tensor(sewn_to(garment.vertex_of_point.numpy()))
+        self.seam_panels = garment.panel_of_point[torch.stack([sewn[some], partner[sewn[some]]], 1)]
 
     def __call__(self, latent: Tensor) -> Tensor:
         """Weighted energy of a code (z,); near a learned garment's about the weights' sum / 10."""
@@ -98,10 +101,9 @@ class Sewable:
         green = 0.5 * torch.stack([u.square().sum(1) - 1, v.square().sum(1) - 1, 2**0.5 * (u * v).sum(1)])
         energy = self.settings.strain * (green.square().sum(0) + 1e-4).sqrt().mean()
         if m:
-            sides = places[3 * n :]
-            energy = (
-                energy + 100 * self.settings.gap * ((sides[:, 0] - sides[:, 1]).square().sum(1) + 1e-8).sqrt().mean()
-            )
+            one, other = places[3 * n :][torch.arange(m)[:, None], self.seam_panels].unbind(1)
+            apart = ((one - other).square().sum(1) + 1e-8).sqrt().mean()
+            energy = energy + 100 * self.settings.gap * apart
         return energy
 
 

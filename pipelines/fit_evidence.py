@@ -44,7 +44,7 @@ class PatternEvidence:
     """Flat panels: their signed distances and border labels (Eq. 2; Eq. 12 with distances signed)."""
 
     def __init__(self, decoder: IspDecoder, panels: list[Border] | list[Outline], count: int = 350, seed: int = 0):
-        """``panels``: front and back, domain units; ``count`` points near each border are looked at."""
+        """``panels``: one border each, domain units; ``count`` points near each border are looked at."""
         rng = np.random.default_rng(seed)
         near = [on_border(b, rng, count)[2] + rng.normal(size=(count, 2)) * 0.02 for b in panels]
         at = np.concatenate([*near, rng.uniform(-1, 1, (count // 2, 2))])
@@ -59,7 +59,9 @@ class PatternEvidence:
     @staticmethod
     def of(decoder: IspDecoder, truth: Garment, seed: int = 0) -> PatternEvidence:
         """A garment's own panels."""
-        return PatternEvidence(decoder, [panel_border(truth, decoder.nets.shape, k) for k in (0, 1)], seed=seed)
+        return PatternEvidence(
+            decoder, [panel_border(truth, decoder.nets.shape, k) for k in range(decoder.panels)], seed=seed
+        )
 
     def renew(self, latent: Tensor) -> None:
         """Nothing depends on the code."""

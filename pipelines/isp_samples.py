@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,8 +30,10 @@ class Border:
     start_3d: NDArray[np.float64]
     """(E, 3)."""
     end_3d: NDArray[np.float64]
+    partner: NDArray[np.int64]
+    """(E,) the panel that the edge is sewn to; -1 on open edges."""
     partner_start: NDArray[np.float64]
-    """(E, 2) the other panel's point that the start is sewn to; NaN on open edges."""
+    """(E, 2) its point that the start is sewn to; NaN on open edges."""
     partner_end: NDArray[np.float64]
     loops: list[Polygon]
     weight: NDArray[np.float64]
@@ -57,26 +59,28 @@ class Outline:
 
 @dataclass(frozen=True)
 class IspSamples:
-    """All garments' samples, ready to be drawn from; domain units throughout."""
+    """All garments' samples, ready to be drawn from; domain units throughout. K panels."""
 
     at: Tensor
     """(n, S, 2) points of the domain."""
     distance: Tensor
-    """(n, S, 2) signed distances to front and back panel."""
+    """(n, S, K) signed distances to each panel."""
     label: Tensor
-    """(n, S, 2) label of the closest border."""
+    """(n, S, K) label of the closest border."""
     positions: Tensor
-    """(n, GRID, GRID, 2, 3) surface of front and back over the domain."""
+    """(n, GRID, GRID, K, 3) surface of each panel over the domain."""
     covered: Tensor
-    """(n, GRID, GRID, 2) bool, inside the panel."""
+    """(n, GRID, GRID, K) bool, inside the panel."""
     cells: Tensor
-    """(n, C, 2) grid points, inside front or back together with their neighbours, repeated to one length."""
+    """(n, C, 2) grid points, inside some panel together with their neighbours, repeated to one length."""
     border_at: Tensor
-    """(n, 2, M, 2) points on the border of front and back."""
+    """(n, K, M, 2) points on the border of each panel."""
     border_3d: Tensor
-    """(n, 2, M, 3)."""
+    """(n, K, M, 3)."""
     seam_at: Tensor
-    """(n, M, 2, 2) points of front and back that are sewn together."""
+    """(n, M, 2, 2) points of two panels that are sewn together."""
+    seam_panel: Tensor
+    """(n, M, 2) which panels."""
     seam_3d: Tensor
     """(n, M, 3)."""
 
@@ -92,7 +96,8 @@ def frame(garments: list[Garment], code: int = 32, margin: float = 1.07) -> IspS
     half = torch.stack([points[:, 0].abs().max(), (high[1] - low[1]) / 2]).max() * margin
     depth = torch.cat([g.mesh.vertices[:, 2] for g in garments]).std()
     first = garments[0]
-    return IspShape(first.kind, tuple(first.seam_names), (0.0, float(middle)), float(half), float(depth), code)
+    shape = IspShape(first.kind, tuple(first.seam_names), (0.0, float(middle)), float(half), float(depth), code)
+    return replace(shape, panel_names=tuple(first.panel_names))
 
 
 def collect(garments: list[Garment], shape: IspShape, generator: np.random.Generator, step: int = 3) -> IspSamples:
@@ -102,10 +107,10 @@ def collect(garments: list[Garment], shape: IspShape, generator: np.random.Gener
 
 
 def _one(garment: Garment, shape: IspShape, rng: np.random.Generator, step: int) -> tuple[NDArray, ...]:
-    borders = [panel_border(garment, shape, k) for k in (0, 1)]
+    borders = [panel_border(garment, shape, k) for k in range(len(shape.panel_names))]
     at = np.concatenate([_around(b, rng) for b in borders] + [rng.uniform(-1, 1, (3072, 2))])
     measured = [signed_distance(b, at) for b in borders]
-    maps = [_position_map(garment, shape, k) for k in (0, 1)]
+    maps = [_position_map(garment, shape, k) for k in range(len(borders))]
     covered = np.stack([m[1] for m in maps], -1)
     whole = covered.copy()
     whole[:-step] &= covered[step:]
@@ -113,7 +118,7 @@ def _one(garment: Garment, shape: IspShape, rng: np.random.Generator, step: int)
     whole[-step:] = whole[:, -step:] = False
     cells = np.stack(np.nonzero(whole.any(-1)), 1)
     points = [along(b, rng, 1024) for b in borders]
-    seam_at, seam_3d = _seam(borders, rng, 1024)
+    seam_at, seam_panel, seam_3d = _seam(borders, rng, 1024)
     return (
         at.astype(np.float32),
         np.stack([d for d, _ in measured], 1).astype(np.float32),
@@ -124,15 +129,14 @@ def _one(garment: Garment, shape: IspShape, rng: np.random.Generator, step: int)
         np.stack([p for p, _ in points]).astype(np.float32),
         np.stack([x for _, x in points]).astype(np.float32),
         seam_at.astype(np.float32),
+        seam_panel,
         seam_3d.astype(np.float32),
     )
 
 
 def panel_border(garment: Garment, shape: IspShape, panel: int) -> Border:
-    """The border of panel 0 (front) or 1 (back) as edges with labels, 3D ends and partners."""
-    faces = garment.panel_faces[garment.panel_of_face == panel].numpy()
-    if signed_areas(garment.panel_points.double().numpy(), faces).sum() < 0:
-        faces = faces[:, [0, 2, 1]]  # the back panel's faces look the other way
+    """The border of one panel as edges with labels, 3D ends and partners."""
+    faces = _upward(garment, panel)
     edges = border_edges(faces)
     vertex = garment.vertex_of_point.numpy()
     centre, half = np.array(shape.centre), shape.half
@@ -143,9 +147,8 @@ def panel_border(garment: Garment, shape: IspShape, panel: int) -> Border:
     turns = _edge_turns(plane, edges)
     # A point's label is that of the border edge which starts there; whether the edge is sewn, the welded mesh says.
     label = np.where(sewn, np.where(labels[:, 0] > 0, labels[:, 0], labels[:, 1]), 0)
-    partner = _partners(garment, panel)[edges]
-    placed = np.where(sewn[:, None, None], plane[np.maximum(partner, 0)], np.nan)
-    placed[(partner < 0)] = np.nan
+    other, partner = _partners(garment, panel, edges)
+    placed = np.where((sewn & (other >= 0))[:, None, None], plane[np.maximum(partner, 0)], np.nan)
     loops = [Polygon(plane[loop]) for loop in border_loops(faces)]
     corner = _near_corner(plane, edges, label, turns, 0.03)
     length = np.linalg.norm(plane[edges[:, 1]] - plane[edges[:, 0]], axis=1)
@@ -154,8 +157,16 @@ def panel_border(garment: Garment, shape: IspShape, panel: int) -> Border:
     ends = plane[edges]
     ends_3d = space[vertex[edges]]
     return Border(
-        ends[:, 0], ends[:, 1], label, ends_3d[:, 0], ends_3d[:, 1], placed[:, 0], placed[:, 1], loops, weight
-    )
+        ends[:, 0], ends[:, 1], label, ends_3d[:, 0], ends_3d[:, 1],
+        np.where(sewn, other, -1), placed[:, 0], placed[:, 1], loops, weight,
+    )  # fmt: skip
+
+
+def _upward(garment: Garment, panel: int) -> NDArray:
+    """(F, 3) faces of one panel, counter-clockwise in the plane: those behind the body look the other way."""
+    faces = garment.panel_faces[garment.panel_of_face == panel].numpy()
+    turned = signed_areas(garment.panel_points.double().numpy(), faces).sum() < 0
+    return faces[:, [0, 2, 1]] if turned else faces
 
 
 def _is_open(garment: Garment, vertex_edges: NDArray) -> NDArray:
@@ -165,13 +176,23 @@ def _is_open(garment: Garment, vertex_edges: NDArray) -> NDArray:
     return np.isin(vertex_edges.min(1) * size + vertex_edges.max(1), rim.min(1) * size + rim.max(1))
 
 
-def _partners(garment: Garment, panel: int) -> NDArray:
-    """(P,) for every point a point of the other panel on the same welded vertex, -1 if none."""
-    other = np.unique(garment.panel_faces[garment.panel_of_face == 1 - panel].numpy())
-    vertex = garment.vertex_of_point.numpy()
-    at = np.full(len(garment.mesh.vertices), -1)
-    at[vertex[other]] = other
-    return at[vertex]
+def _partners(garment: Garment, panel: int, edges: NDArray) -> tuple[NDArray, NDArray]:
+    """For border edges (E, 2) of a panel: the other panel with an edge of the same welded vertices (E,), -1 if there is
+    none, and its points at start and end (E, 2)."""
+    vertex, size = garment.vertex_of_point.numpy(), len(garment.mesh.vertices)
+
+    def keys(pairs: NDArray) -> NDArray:
+        ends = vertex[pairs]
+        return ends.min(1) * size + ends.max(1)
+
+    found, points = np.full(len(edges), -1), np.full(edges.shape, -1)
+    for other in range(len(garment.panel_names)):
+        theirs = border_edges(_upward(garment, other)) if other != panel else edges[:0]
+        _, mine, row = np.intersect1d(keys(edges), keys(theirs), return_indices=True)
+        turned = vertex[edges[mine, 0]] != vertex[theirs[row, 0]]
+        found[mine] = other
+        points[mine] = np.where(turned[:, None], theirs[row][:, ::-1], theirs[row])
+    return found, points
 
 
 def _edge_turns(plane: NDArray, edges: NDArray) -> NDArray:
@@ -251,17 +272,25 @@ def _around(border: Border, rng: np.random.Generator, count: int = 5120) -> NDAr
     return np.clip(along(border, rng, count)[0] + rng.normal(size=(count, 2)) * spread, -1, 1)
 
 
-def _seam(borders: list[Border], rng: np.random.Generator, count: int) -> tuple[NDArray, NDArray]:
-    """Pairs of sewn points (count, 2, 2) and their common place (count, 3)."""
-    front = borders[0]
-    known = ~np.isnan(front.partner_start + front.partner_end).any(1) & (front.label > 0)
-    weight = np.where(known, front.weight, 0.0)
+def _seam(borders: list[Border], rng: np.random.Generator, count: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Pairs of sewn points (count, 2, 2), their panels (count, 2) and their common place (count, 3)."""
+    panel = np.repeat(np.arange(len(borders)), [len(b.start) for b in borders])
+
+    def all_of(name: str) -> NDArray:
+        return np.concatenate([getattr(border, name) for border in borders])
+
+    partner = all_of("partner")
+    # Each seam once, from the first of its panels.
+    known = (partner > panel) & (all_of("label") > 0)
+    weight = np.where(known, all_of("weight"), 0.0)
     edge = rng.choice(len(weight), size=count, p=weight / weight.sum())
     t = rng.random((count, 1))
-    flat = front.start[edge] + t * (front.end[edge] - front.start[edge])
-    partner = front.partner_start[edge] + t * (front.partner_end[edge] - front.partner_start[edge])
-    space = front.start_3d[edge] + t * (front.end_3d[edge] - front.start_3d[edge])
-    return np.stack([flat, partner], 1), space
+
+    def between(start: str, end: str) -> NDArray:
+        return (1 - t) * all_of(start)[edge] + t * all_of(end)[edge]
+
+    flat = np.stack([between("start", "end"), between("partner_start", "partner_end")], 1)
+    return flat, np.stack([panel[edge], partner[edge]], 1), between("start_3d", "end_3d")
 
 
 def _position_map(garment: Garment, shape: IspShape, panel: int) -> tuple[NDArray, NDArray]:

@@ -230,5 +230,6 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         names = ("panel_points", "panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
         tensors |= {f"garment.{name}": getattr(thing, name) for name in names}
         card |= {"kind": thing.kind, "seam_names": list(thing.seam_names), "variant": thing.variant}
+        card |= {"panel_names": list(thing.panel_names)}
     places = ("garment.vertices", "garment.panel_points")
     return write_weights(f"gaps-{config.name}", tensors, card, config.out, exact=places)

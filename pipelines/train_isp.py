@@ -35,7 +35,7 @@ class TrainIsp:
     """Settings of one training."""
 
     kind: str
-    """Garment kind: top, skirt, trousers or dress."""
+    """Garment kind: top, skirt, trousers, dress or shirt6 (six panels; needs ``data``)."""
     data: Path | None = None
     """Folder of the garment data set (<kind>_train.npz, <kind>_test.npz); the one that ships if not given."""
     start: Path | None = None
@@ -55,9 +55,9 @@ class TrainIsp:
     batch: int = 8
     """Garments per step."""
     surface_points: int = 96
-    """Places per garment and step at which the surface map is compared (three points each, both panels)."""
+    """Places per garment and step at which the surface map is compared (three points each, all panels)."""
     border_points: int = 32
-    """Border points and seam points per garment and step."""
+    """Points per garment and step on each panel's border, and on seams."""
     pattern_points: int = 320
     """Signed distance samples per garment and step."""
     rate: float = 2e-3
@@ -158,7 +158,10 @@ def known_codes(decoder: IspDecoder, samples: IspSamples, count: int = 256) -> T
     fields = [decoder.nets.pattern.fold(z) for z in decoder.codes]
     best = []
     for at, distance in zip(samples.at[:, ::41][:, :count], samples.distance[:, ::41][:, :count], strict=True):
-        off = [(decoder.nets.pattern.run_folded(field, at)[:, :2] - distance).abs().mean() for field in fields]
+        off = [
+            (decoder.nets.pattern.run_folded(field, at)[:, : decoder.panels] - distance).abs().mean()
+            for field in fields
+        ]
         best.append(int(torch.stack(off).argmin()))
     return decoder.codes[best]
 
@@ -211,7 +214,7 @@ def batch_loss(
 def pattern_loss(
     nets: IspNets, z: Tensor, samples: IspSamples, garments: Tensor, count: int, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Eq. 2: signed distance (L1) and edge labels (cross entropy) of both panels."""
+    """Eq. 2: signed distance (L1) and edge labels (cross entropy) of all panels."""
     pick = torch.randint(samples.at.shape[1], (len(garments), count), generator=generator)
     row = garments[:, None]
     x, target, label = samples.at[row, pick], samples.distance[row, pick], samples.label[row, pick]
@@ -230,26 +233,29 @@ def surface_loss(
     nets: IspNets, z: Tensor, samples: IspSamples, garments: Tensor, config: TrainIsp, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Eq. 4 and 5 by correspondence: points, differences, normals, borders, seams and seam gaps."""
-    n, b, m = len(garments), config.surface_points, config.border_points
+    n, b, m, panels = len(garments), config.surface_points, config.border_points, len(nets.shape.panel_names)
     row = garments[:, None]
     corner = samples.cells[row, torch.randint(samples.cells.shape[1], (n, b), generator=generator)].long()
     cells = (corner[:, :, None] + torch.tensor([[0, 0], [STEP, 0], [0, STEP]])).flatten(1, 2)
-    target = samples.positions[row, cells[..., 0], cells[..., 1]].view(n, b, 3, 2, 3)
-    mask = samples.covered[row, cells[..., 0], cells[..., 1]].view(n, b, 3, 2).float()
-    pick = torch.randint(samples.border_at.shape[2], (n, 3, m), generator=generator)
-    rim = torch.stack([samples.border_at[row, k, pick[:, k]] for k in (0, 1)], 1)
-    rim_3d = torch.stack([samples.border_3d[row, k, pick[:, k]] for k in (0, 1)], 1)
-    seam, seam_3d = samples.seam_at[row, pick[:, 2]], samples.seam_3d[row, pick[:, 2]]
+    target = samples.positions[row, cells[..., 0], cells[..., 1]].view(n, b, 3, panels, 3)
+    mask = samples.covered[row, cells[..., 0], cells[..., 1]].view(n, b, 3, panels).float()
+    pick = torch.randint(samples.border_at.shape[2], (n, panels + 1, m), generator=generator)
+    rim = torch.stack([samples.border_at[row, k, pick[:, k]] for k in range(panels)], 1)
+    rim_3d = torch.stack([samples.border_3d[row, k, pick[:, k]] for k in range(panels)], 1)
+    seam, seam_panel, seam_3d = (
+        part[row, pick[:, panels]] for part in (samples.seam_at, samples.seam_panel, samples.seam_3d)
+    )
     x = torch.cat([cells * (2 / (GRID - 1)) - 1, rim.flatten(1, 2), seam.transpose(1, 2).flatten(1, 2)], 1)
     with torch.autocast(x.device.type, torch.bfloat16):
         out = nets.surface(x, z)
     places = nets.lift(out, x)
-    found = places[:, : 3 * b].view(n, b, 3, 2, 3)
-    border = places[:, 3 * b : 3 * b + 2 * m].view(n, 2, m, 2, 3)
-    joint = places[:, 3 * b + 2 * m :].view(n, 2, m, 2, 3)
+    inner, border, joint = places.split([3 * b, panels * m, 2 * m], 1)
+    found = inner.unflatten(1, (b, 3))
+    border = border.unflatten(1, (panels, m))
+    joint = joint.unflatten(1, (2, m))
     terms = _compare(found, target, mask)
-    terms["border"] = torch.stack([_length(border[:, k, :, k] - rim_3d[:, k]).mean() for k in (0, 1)]).mean()
-    sides = [joint[:, k, :, k] for k in (0, 1)]
+    terms["border"] = torch.stack([_length(border[:, k, :, k] - rim_3d[:, k]).mean() for k in range(panels)]).mean()
+    sides = [_of_panel(joint[:, k], seam_panel[..., k]) for k in (0, 1)]
     terms["seam"] = torch.stack([_length(side - seam_3d).mean() for side in sides]).mean()
     terms["gap"] = _length(sides[0] - sides[1]).mean()
     weights = {"point": 1.0, "border": 0.5, "seam": 0.5 * config.consist, "gap": 0.5 * config.consist}
@@ -259,12 +265,17 @@ def surface_loss(
     return loss, {names[k]: v.detach() for k, v in terms.items() if k in names}
 
 
+def _of_panel(places: Tensor, panel: Tensor) -> Tensor:
+    """(n, M, K, 3) places on all panels and (n, M) one panel each -> (n, M, 3)."""
+    return places.gather(2, panel[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
+
+
 def _length(v: Tensor) -> Tensor:
     return (v.square().sum(-1) + 1e-9).sqrt()
 
 
 def _compare(found: Tensor, target: Tensor, mask: Tensor) -> dict[str, Tensor]:
-    """Points, differences and normals of (n, B, 3, 2, 3) corner triples; mask (n, B, 3, 2)."""
+    """Points, differences and normals of (n, B, 3, K, 3) corner triples; mask (n, B, 3, K)."""
     whole = mask.amin(2)
     point = (_length(found - target) * mask).sum() / mask.sum().clamp_min(1)
     u, v = found[:, :, 1] - found[:, :, 0], found[:, :, 2] - found[:, :, 0]

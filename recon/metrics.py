@@ -141,12 +141,12 @@ def boundary_loops(faces: Tensor) -> int:
 
 
 def panel_iou(found: Garment, truth: Garment, cell: float = 0.004) -> float:
-    """Intersection over union of two garments' flat panels, front and back together, on a raster of ``cell`` [m]."""
+    """Intersection over union of two garments' flat panels, all together, on a raster of ``cell`` [m]."""
     both = torch.cat([found.panel_points.detach(), truth.panel_points.detach()])
     low, high = both.amin(0) - cell, both.amax(0) + cell
     shape = [int(n) for n in ((high - low) / cell).ceil()]
     inter = union = 0
-    for panel in (0, 1):
+    for panel in range(len(truth.panel_names)):
         a, b = (_raster(g, panel, low.numpy(), cell, shape) for g in (found, truth))
         inter += int((a & b).sum())
         union += int((a | b).sum())

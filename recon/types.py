@@ -102,6 +102,15 @@ class Camera:
         return p[..., :2] / p[..., 2:].clamp_min(1e-6)
 
 
+TWO_PANELS = ("front", "back")
+"""Panels of most garments."""
+
+
+def behind(panel: str) -> bool:
+    """Whether a panel lies behind the body: its name has the word ``back`` (back, sleeve_back_left)."""
+    return "back" in panel.split("_")
+
+
 @dataclass(frozen=True)
 class Garment:
     """A sewn, welded, open garment mesh in the neutral body's T-pose space, with the panels that it was cut from.
@@ -115,11 +124,11 @@ class Garment:
     mesh: Mesh
     """(V, 3) welded vertices, rest pose on the neutral body [m]; differentiable in the latent when decoded."""
     panel_points: Tensor
-    """(P, 2) panel coordinates [m], x to the wearer's left, y up; front panel's and back panel's share one plane."""
+    """(P, 2) panel coordinates [m], x to the wearer's left, y up; all panels share one plane."""
     panel_faces: Tensor
     """(F, 3) long, indices into panel_points, corner by corner the same triangles as mesh.faces."""
     panel_of_face: Tensor
-    """(F,) long, 0 = front panel, 1 = back panel."""
+    """(F,) long, index into ``panel_names``."""
     vertex_of_point: Tensor
     """(P,) long, the welded vertex of each panel point."""
     border_labels: Tensor
@@ -132,6 +141,8 @@ class Garment:
     """Finer name within the kind (tank, tshirt, shirt, jacket, shorts ...), where known."""
     unstrained: Tensor | None = None
     """(V, 3) where a garment without panels is unstrained [m]; None = at rest as it is."""
+    panel_names: tuple[str, ...] = TWO_PANELS
+    """Names of the panels; :func:`behind` says which of them lie behind the body."""
 
     @staticmethod
     def bare(kind: str, mesh: Mesh) -> Garment:
@@ -143,6 +154,23 @@ class Garment:
     def has_panels(self) -> bool:
         """Whether it was cut from panels that are known."""
         return len(self.panel_faces) > 0
+
+    @property
+    def side_of_face(self) -> Tensor:
+        """(F,) long, 0 = before the body, 1 = behind it; faces there run clockwise in the plane."""
+        return self.panel_of_face.new_tensor([behind(name) for name in self.panel_names])[self.panel_of_face]
+
+    @property
+    def panel_of_point(self) -> Tensor:
+        """(P,) long, index into ``panel_names``."""
+        panel = torch.zeros(len(self.panel_points), dtype=torch.long, device=self.panel_faces.device)
+        panel[self.panel_faces] = self.panel_of_face[:, None].expand(-1, 3)
+        return panel
+
+    @property
+    def side_of_point(self) -> Tensor:
+        """(P,) long, 0 = before the body, 1 = behind it."""
+        return self.panel_of_face.new_tensor([behind(name) for name in self.panel_names])[self.panel_of_point]
 
 
 @dataclass(frozen=True)

@@ -50,13 +50,13 @@ class Constraints:
 
 
 def _panel_positions(garment: Garment) -> NDArray:
-    """(V, 3) flat positions with a metre between the panels; seam vertices lie with the front."""
+    """(V, 3) flat positions with a metre between front and back; seam vertices lie with the front."""
     vertex, points = garment.vertex_of_point.numpy(), garment.panel_points.detach().double().numpy()
     out = np.zeros((int(vertex.max()) + 1, 3))
-    for panel in (1, 0):
-        mine = np.unique(garment.panel_faces[garment.panel_of_face == panel].numpy())
+    for side in (1, 0):
+        mine = np.unique(garment.panel_faces[garment.side_of_face == side].numpy())
         out[vertex[mine], :2] = points[mine]
-        out[vertex[mine], 2] = -float(panel)
+        out[vertex[mine], 2] = -float(side)
     return out
 
 

@@ -74,7 +74,7 @@ class Cloth:
             at = garment.mesh.vertices if garment.unstrained is None else garment.unstrained
             return cls.from_mesh(Mesh(at.to(garment.panel_points.dtype), garment.mesh.faces), fabric)
         flat = garment.panel_points.detach()[garment.panel_faces]  # (F, 3, 2)
-        flat = torch.where((garment.panel_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
+        flat = torch.where((garment.side_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
         return cls.from_triangles(garment.mesh.faces, flat, garment.mesh.vertices.shape[-2], fabric)
 
     @classmethod

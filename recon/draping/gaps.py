@@ -22,7 +22,7 @@ from recon.bodies.rig import rotation_matrices
 from recon.bodies.skin import skin
 from recon.draping.binding import METHODS, BodyField, cloth_operators
 from recon.files.weights import read_weights
-from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
+from recon.types import TWO_PANELS, BodyPose, Garment, Mesh, PosedBody, UserError
 
 FEATURES = 23 * 6 + 3 + 3 + 3
 """Numbers per frame: joints 1..23 as two columns of their rotations, gravity, velocity and turning of the pelvis."""
@@ -227,6 +227,10 @@ def build(tensors: dict[str, Tensor], card: dict, body) -> GapsDraper:
             panel_points=tensors["garment.panel_points"].float(),
             seam_names=tuple(card["seam_names"]),
             variant=card["variant"],
-            **panels,
+            panel_names=tuple(card.get("panel_names", TWO_PANELS)),
+            panel_faces=panels["panel_faces"],
+            panel_of_face=panels["panel_of_face"],
+            vertex_of_point=panels["vertex_of_point"],
+            border_labels=panels["border_labels"],
         )
     return GapsDraper(net, thing, Bound.of(mesh.vertices, mesh.faces, body, card["skinning"]))

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from recon.bodies.rig import PARENTS
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
-from recon.draping.uv import Box, Welding, around, compose, map_size, modes, panel_of_point, rest_features
+from recon.draping.uv import Box, Welding, around, compose, map_size, modes, rest_features
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
 
@@ -138,7 +138,7 @@ class Worn:
     def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:
         """Bind, read the rest maps, and find the panel points' places on the displacement maps."""
         box = net.shape.box
-        rows, shares = around(box, map_size(box), garment.panel_points.to(net.mean), panel_of_point(garment))
+        rows, shares = around(box, map_size(box), garment.panel_points.to(net.mean), garment.side_of_point)
         weights, directions = skinning.bind(garment.mesh.vertices, garment.mesh.faces)
         return cls(
             Bound(garment.mesh.vertices, weights, directions),

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from recon.cloth.constraints import open_rim
 from recon.cloth.contact import BodyContact
-from recon.draping.uv import FLAT_SCALE, Welding, panel_of_point
+from recon.draping.uv import FLAT_SCALE, Welding
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, UserError
 
@@ -147,7 +147,7 @@ class Raster:
         rest = (garment.mesh.vertices.detach().float()[corners] * weights[..., None]).sum(1)
         rest = FLAT_SCALE * torch.cat([rest[:, :2] - nodes.repeat(2, 1), rest[:, 2:]], 1) * inside
         grid = 2 * (points - low) / (CELL * (torch.tensor(size) - 1)) - 1
-        panel = panel_of_point(garment)
+        panel = garment.side_of_point
         return cls((size[0], size[1]), corners, weights, inside, rest, grid, panel, Welding.of(garment))
 
     def maps(self, values: Tensor) -> Tensor:
@@ -172,9 +172,9 @@ class Raster:
         return self.welding(values[..., :-1] / values[..., -1:].clamp_min(0.05))
 
 
-def _locate(garment: Garment, points: Tensor, nodes: Tensor, panel: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices (N, 3), shares (N, 3) and presence (N, 1) of the cloth of one panel at map nodes (N, 2)."""
-    faces = garment.panel_faces[garment.panel_of_face == panel]
+def _locate(garment: Garment, points: Tensor, nodes: Tensor, side: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices (N, 3), shares (N, 3) and presence (N, 1) of the cloth on one side of the body at map nodes (N, 2)."""
+    faces = garment.panel_faces[garment.side_of_face == side]
     flat = BodyContact(F.pad(points, (0, 1)), faces)
     face, weights, _ = flat.closest(F.pad(nodes, (0, 1)))
     on = (points[faces[face]] * weights[..., None]).sum(1)

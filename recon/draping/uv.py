@@ -99,13 +99,6 @@ def around(box: Box, cells: tuple[int, int], points: Tensor, panel: Tensor) -> t
     return rows, torch.cat([(1 - x) * (1 - y), (1 - x) * y, x * (1 - y), x * y], 1)
 
 
-def panel_of_point(garment: Garment) -> Tensor:
-    """(P,) long, 0 for points of the front panel, 1 for those of the back panel."""
-    panel = torch.zeros(len(garment.panel_points), dtype=torch.long, device=garment.panel_faces.device)
-    panel[garment.panel_faces[garment.panel_of_face == 1].flatten()] = 1
-    return panel
-
-
 @dataclass(frozen=True)
 class Welding:
     """How points of the panels make vertices: a vertex at a seam is the mean of its points."""
@@ -157,4 +150,4 @@ def rest_features(garment: Garment, box: Box, cells: tuple[int, int]) -> Tensor:
     away = FLAT_SCALE * torch.cat([away[:, :2] - points, away[:, 2:]], 1)
     node = box.size[0] * box.size[1] / ((cells[0] - 1) * (cells[1] - 1))
     values = torch.cat([torch.ones_like(away[:, :1]), away], 1) * (area / node)[:, None]
-    return splat(box, cells, points, panel_of_point(garment), values).flatten()
+    return splat(box, cells, points, garment.side_of_point, values).flatten()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.files.atomic import write_whole
-from recon.types import Garment
+from recon.types import Garment, behind
 
 MARGIN = 40.0
 """White around the pieces [mm]."""
@@ -36,7 +36,7 @@ class Run:
     points: NDArray[np.float64]
     """(N, 2) from end to end [mm], page axes (y down); first = last where the whole loop is one run."""
     vertices: frozenset[int]
-    """Welded vertices along it: both panels' runs of one seam have the same."""
+    """Welded vertices along it: the runs of one seam on both panels have the same."""
 
     @property
     def length(self) -> float:
@@ -66,8 +66,8 @@ class Piece:
 def write_svg(garment: Garment, path: str | Path, name: str = "") -> None:
     """Write the garment's panels at true scale: cut lines, numbered seams with lengths, grain lines, names, scale bar.
 
-    One unit of the drawing is one millimetre on paper. Both panels are drawn as seen from outside, front left, back
-    right; no seam allowance. ``name`` defaults to the file's stem. NaN or infinite coordinates are a ValueError.
+    One unit of the drawing is one millimetre on paper. Panels are drawn side by side as seen from outside, the
+    front first; no seam allowance. ``name`` defaults to the file's stem. NaN or infinite coordinates are a ValueError.
     """
     path = Path(path)
     write_whole(path, pattern_svg(garment, name or path.stem))
@@ -78,7 +78,7 @@ def pattern_svg(garment: Garment, name: str) -> str:
     points = garment.panel_points.detach().cpu().double()
     if not np.isfinite(points.numpy()).all():
         raise ValueError(f"{name}: panel coordinates are NaN or infinite; nothing was written")
-    pieces, (width, height) = _lay_out([cut_pieces(garment, panel) for panel in (0, 1)])
+    pieces, (width, height) = _lay_out([cut_pieces(garment, panel) for panel in range(len(garment.panel_names))])
     size = float(np.clip(0.011 * width, 8.0, 26.0))
     numbers = _seam_numbers(pieces)
     height += 3.5 * size
@@ -116,13 +116,13 @@ def _foot(title: str, height: float, size: float) -> str:
 
 
 def cut_pieces(garment: Garment, panel: int) -> list[Piece]:
-    """The connected pieces of one panel (0 front, 1 back), from the wearer's right to the left, in millimetres.
+    """The connected pieces of one panel, from the wearer's right to the left, in millimetres.
 
     Page axes: y down, x to the wearer's left for the front and mirrored for the back, as each is seen from outside.
     """
-    points = (
-        garment.panel_points.detach().cpu().double().numpy() * 1000.0 * np.array([1.0 if panel == 0 else -1.0, -1.0])
-    )
+    title = garment.panel_names[panel]
+    mirror = np.array([-1.0 if behind(title) else 1.0, -1.0])
+    points = garment.panel_points.detach().cpu().double().numpy() * 1000.0 * mirror
     faces = garment.panel_faces.cpu().numpy()
     of_face = garment.panel_of_face.cpu().numpy()
     vertex = garment.vertex_of_point.cpu().numpy()
@@ -138,7 +138,7 @@ def cut_pieces(garment: Garment, panel: int) -> list[Piece]:
     for k, loops in enumerate(ordered):
         runs = [run for loop in loops for run in _runs(loop, points, labels, vertex, across)]
         side = "" if len(ordered) == 1 else f" {k + 1} of {len(ordered)}"
-        made.append(Piece(("front", "back")[panel] + side, [points[loop] for loop in loops], runs))
+        made.append(Piece(title.replace("_", " ") + side, [points[loop] for loop in loops], runs))
     return made
 
 
@@ -190,7 +190,7 @@ def _runs(
 ) -> list[Run]:
     """The loop cut where its meaning changes.
 
-    ``across``: welded border edges of the other panel; an edge is sewn where both panels have it. A seam's end point
+    ``across``: welded border edges of the other panels; an edge is sewn where two panels have it. A seam's end point
     may carry either neighbour's label, so where two labels meet the edge takes that of the end which turns less: not
     the corner.
     """

@@ -16,6 +16,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "skirt": ("skirt",),
     "trousers": ("trousers", "shorts"),
     "dress": ("dress",),
+    "shirt6": ("tshirt6", "shirt6"),
 }
 """Garment kind (one decoder each) -> its variants."""
 

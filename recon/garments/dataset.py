@@ -18,8 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from recon.garments.patterns import SEAM_NAMES
-from recon.types import Garment, Mesh, UserError
+from recon.garments.patterns import PANEL_NAMES, SEAM_NAMES
+from recon.types import TWO_PANELS, Garment, Mesh, UserError
 
 QUANTUM = 5e-5
 """Resolution of stored positions [m]."""
@@ -28,6 +28,7 @@ VARIANTS: dict[str, dict[str, float]] = {
     "skirt": {"skirt": 1.0},
     "trousers": {"trousers": 0.72, "shorts": 0.28},
     "dress": {"dress": 1.0},
+    "shirt6": {"tshirt6": 0.45, "shirt6": 0.55},
 }
 """Share of each variant in its kind."""
 SPLITS = ("train", "test")
@@ -89,7 +90,8 @@ def write_items(path: Path, kind: str, items: Sequence[Item]) -> None:
         columns["faces"].append(faces.astype(np.uint16))
         columns["welds"].append(g.vertex_of_point.numpy().astype(np.uint16))
         columns["labels"].append(g.border_labels.numpy().astype(np.int8))
-        columns["fronts"].append(np.array([int((g.panel_of_face == 0).sum())], np.int32))
+        counts = torch.bincount(g.panel_of_face, minlength=len(g.panel_names))
+        columns["fronts"].append(counts[:-1].numpy().astype(np.int32))
     arrays: dict[str, NDArray] = {f"count_{k}": np.array([len(a) for a in v], np.int32) for k, v in columns.items()}
     for name in ("vertices", "points", "faces"):
         arrays[name] = _encode(columns[name])
@@ -100,6 +102,7 @@ def write_items(path: Path, kind: str, items: Sequence[Item]) -> None:
     meta = {
         "kind": kind,
         "seam_names": list(SEAM_NAMES[kind]),
+        "panel_names": list(PANEL_NAMES.get(kind, TWO_PANELS)),
         "variants": [g.variant for g in garments],
         "parameters": [{k: round(v, 6) for k, v in item.parameters.items()} for item in items],
         "attempts": [item.attempts for item in items],
@@ -128,6 +131,8 @@ def read_items(path: Path) -> list[Item]:
             f"{path}: no garment file ({type(error).__name__}), wanted one of `recon dataset make`"
         ) from None
     items = []
+    panel_names = tuple(meta.get("panel_names", TWO_PANELS))
+    fronts = torch.tensor(arrays["fronts"]).long().view(-1, len(panel_names) - 1)
     for i, variant in enumerate(meta["variants"]):
         welds = torch.tensor(columns["welds"][i][:, 0].astype(np.int64) & 0xFFFF)
         faces = torch.tensor(columns["faces"][i].astype(np.int64) & 0xFFFF)
@@ -137,11 +142,12 @@ def read_items(path: Path) -> list[Item]:
             mesh=Mesh(vertices, welds[faces]),
             panel_points=torch.tensor((columns["points"][i].astype(np.float64) * QUANTUM).astype(np.float32)),
             panel_faces=faces,
-            panel_of_face=(torch.arange(len(faces)) >= int(arrays["fronts"][i])).long(),
+            panel_of_face=torch.bucketize(torch.arange(len(faces)), fronts[i].cumsum(0), right=True),
             vertex_of_point=welds,
             border_labels=torch.tensor(labels[i].astype(np.int64)),
             seam_names=tuple(meta["seam_names"]),
             variant=variant,
+            panel_names=panel_names,
         )
         items.append(
             Item(

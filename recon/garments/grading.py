@@ -88,11 +88,11 @@ def _as_cut(garment: Garment) -> tuple[Tensor, Tensor]:
 
 
 def _between_panels(garment: Garment, points: Tensor) -> Tensor:
-    """(P,) 1 on the front panel and -1 on the back one, fading to 0 at seams."""
+    """(P,) 1 on what lies before the body and -1 behind it, fading to 0 where the two are sewn together."""
     vertex = garment.vertex_of_point.cpu()
-    sewn = torch.bincount(vertex)[vertex] > 1
-    side = torch.ones(len(points), dtype=points.dtype)
-    side[garment.panel_faces[garment.panel_of_face == 1].cpu().flatten()] = -1.0
+    side = 1.0 - 2.0 * garment.side_of_point.cpu().to(points.dtype)
+    level = torch.zeros(int(vertex.max()) + 1, dtype=points.dtype).index_add(0, vertex, side)
+    sewn = level[vertex].abs() < torch.bincount(vertex)[vertex]  # its points are not all on one side
     if not sewn.any():
         return side
     distance = torch.from_numpy(cKDTree(points[sewn].numpy()).query(points.numpy())[0])

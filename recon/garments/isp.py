@@ -14,7 +14,7 @@ from recon.garments.isp_lattice import Lattice, lattice
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
 from recon.garments.panels import cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
-from recon.types import Garment, Mesh, UserError, to_device
+from recon.types import Garment, Mesh, UserError, behind, to_device
 
 COARSE = (32, 128)
 """Cells of the coarser grids along each axis."""
@@ -61,6 +61,11 @@ class IspDecoder:
         """Names of the border labels."""
         return self.nets.shape.seam_names
 
+    @property
+    def panels(self) -> int:
+        """How many panels garments of the kind have (K)."""
+        return len(self.nets.shape.panel_names)
+
     def to(self, device: str | torch.device) -> IspDecoder:
         """The same decoder on another device."""
         self.nets.to(device)
@@ -80,7 +85,7 @@ class IspDecoder:
         with torch.no_grad():
             field = self.nets.pattern.fold(code)
             sewn = self._cut_and_sew(field, self._distance_grid(field, resolution))
-        plan = _Plan.make(sewn, latent, resolution)
+        plan = _Plan.make(sewn, latent, self.panels, resolution)
         steps = 2.0 / resolution * MAX_STEP
         points = self._on_border(field, plan, plan.points, steps, 1)
         return self._remember(self._garment(latent, replace(plan, points=points), None), plan)
@@ -96,27 +101,28 @@ class IspDecoder:
         else:
             points = self.nets.to_domain(garment.panel_points.detach())
             topology = (garment.panel_faces, garment.panel_of_face, garment.vertex_of_point, garment.border_labels)
-            plan = _Plan.make(Sewn(points.cpu().double().numpy(), *(t.cpu().numpy() for t in topology)), latent)
+            sewn = Sewn(points.cpu().double().numpy(), *(t.cpu().numpy() for t in topology))
+            plan = _Plan.make(sewn, latent, self.panels)
         with torch.no_grad():
             field = self.nets.pattern.fold(latent.detach())
         points = self._on_border(field, plan, plan.points, 0.05, 2)
         return self._remember(self._garment(latent, replace(plan, points=points), garment), plan)
 
     def pattern(self, latent: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """I_Θ at panel points x (N, 2) [m]: signed distance (N, 2) [m] of front and back, label logits (N, 2, L)."""
+        """I_Θ at panel points x (N, 2) [m]: signed distance (N, K) [m] of each panel, label logits (N, K, L)."""
         layers = self.nets.pattern.fold(latent)
         distance, logits = self.nets.split_pattern(self.nets.pattern.run_folded(layers, self.nets.to_domain(x)))
         return distance * self.nets.shape.half, logits
 
     def surface(self, latent: Tensor, x: Tensor) -> Tensor:
-        """A_Φ at panel points x (N, 2) [m] -> (N, 2, 3) points of front and back in rest space [m]."""
+        """A_Φ at panel points x (N, 2) [m] -> (N, K, 3) points of each panel in rest space [m]."""
         at = self.nets.to_domain(x)
         return self.nets.to_world(self.nets.lift(self.nets.surface.run_folded(self.nets.surface.fold(latent), at), at))
 
     def _cut_and_sew(self, field: list[Layer], distance: np.ndarray):
         cell = 2.0 / (len(distance) - 1)
         panels, labels = [], []
-        for k in (0, 1):
+        for k in range(self.panels):
             panel = cut_panel(distance[:, :, k])
             if len(panel.faces) < 8:
                 raise UserError(f"{self.kind}: the code describes no garment; start from a learned code")
@@ -127,10 +133,10 @@ class IspDecoder:
             points = move_safely(panel.points, panel.faces, border, target.cpu().double().numpy())
             panels.append(replace(panel, points=points))
             labels.append(logits.argmax(-1).cpu().numpy())
-        return sew(panels[0], panels[1], labels[0], labels[1], cell)
+        return sew(panels, labels, [behind(name) for name in self.nets.shape.panel_names], cell)
 
     def _distance_grid(self, field: list[Layer], resolution: int) -> np.ndarray:
-        """(R+1, R+1, 2) signed distances; what coarser grids rule out is not evaluated: ±FAR."""
+        """(R+1, R+1, K) signed distances; what coarser grids rule out is not evaluated: ±FAR."""
         axis = torch.as_tensor(grid_axis(resolution), dtype=self.codes.dtype, device=self.codes.device)
         levels = [cells for cells in COARSE if 2 * cells <= resolution]
         known = needed = None
@@ -142,10 +148,10 @@ class IspDecoder:
         return self._refine(field, axis, known, needed).double().cpu().numpy()
 
     def _refine(self, field: list[Layer], axis: Tensor, known: Tensor | None, needed: Tensor | None) -> Tensor:
-        """Signed distances (n, n, 2) at all pairs of ``axis``, evaluated in ``needed`` coarse cells only."""
+        """Signed distances (n, n, K) at all pairs of ``axis``, evaluated in ``needed`` coarse cells only."""
         if known is None or needed is None:
             grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), -1)
-            return self._distance(field, grid.view(-1, 2)).view(*grid.shape)
+            return self._distance(field, grid.view(-1, 2)).unflatten(0, grid.shape[:2])
         cell = ((axis + 1) * (len(known) / 2)).long().clamp(0, len(known) - 1)
         distance = torch.where(known > 0, FAR, -FAR).to(axis.dtype)[cell[:, None], cell[None]]
         i, j = needed[cell[:, None], cell[None]].nonzero(as_tuple=True)
@@ -153,9 +159,9 @@ class IspDecoder:
         return distance
 
     def _distance(self, field: list[Layer], x: Tensor) -> Tensor:
-        """(N, 2) signed distances, good to a tenth of a fine grid's cell: what they cut is projected afterwards."""
+        """(N, K) signed distances, good to a tenth of a fine grid's cell: what they cut is projected afterwards."""
         with torch.autocast(x.device.type, torch.bfloat16, enabled=halves_are_fast(x.device)):
-            return self.nets.pattern.run_folded(field, x)[:, :2].to(x.dtype)
+            return self.nets.pattern.run_folded(field, x)[:, : self.panels].to(x.dtype)
 
     def _slope(self, field: list[Layer], x: Tensor, panel: Tensor, halves: bool = False):
         """Signed distance (N,), its gradient (N, 2) in x, and label logits (N, L) of each point's own panel.
@@ -223,6 +229,7 @@ class IspDecoder:
             seam_names=self.seam_names,
             latent=latent,
             variant=self._variant_near(latent),
+            panel_names=self.nets.shape.panel_names,
         )
 
     def _variant_near(self, latent: Tensor) -> str:
@@ -239,7 +246,7 @@ def _detached(layer: Layer) -> Layer:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Fixed topology, arranged for evaluation: inner grid points that both panels share are lifted once."""
+    """Fixed topology, arranged for evaluation: inner grid points that several panels share are lifted once."""
 
     points: Tensor
     """(P, 2) domain."""
@@ -250,7 +257,7 @@ class _Plan:
     border: Tensor
     """(B,) indices of border points."""
     border_panel: Tensor
-    """(B,) 0 front, 1 back."""
+    """(B,) the panel of each."""
     inner: Tensor
     """(I,) one representative per distinct inner point that the network is asked about."""
     between: Tensor
@@ -258,16 +265,16 @@ class _Plan:
     lattice: Lattice
     """Where those J come from, among the I."""
     lifted_row: Tensor
-    """(P,) row of each point among 2 (I + B + J) lifted positions, front and back of a point beside each other."""
+    """(P,) row of each point among K (I + B + J) lifted positions, all panels of a point beside each other."""
     points_per_vertex: Tensor
     n_vertices: int
 
     @staticmethod
-    def make(sewn: Sewn, like: Tensor, resolution: int = 0) -> _Plan:
+    def make(sewn: Sewn, like: Tensor, panels: int, resolution: int = 0) -> _Plan:
         """Tensors take the device and dtype of ``like``; ``resolution`` of the grid: fine ones are interpolated."""
         points, faces, labels = sewn.points, sewn.faces, sewn.labels
         panel = np.zeros(len(points), np.int64)
-        panel[faces[sewn.panel_of_face == 1]] = 1
+        panel[faces] = sewn.panel_of_face[:, None]
         border, inside = np.nonzero(labels >= 0)[0], np.nonzero(labels < 0)[0]
         keys = np.round((points[inside] + 2) * 2**22).astype(np.int64)
         _, first, which = np.unique(keys[:, 0] * 2**30 + keys[:, 1], return_index=True, return_inverse=True)
@@ -277,8 +284,8 @@ class _Plan:
         place[asked] = np.arange(asked.sum())
         place[~asked] = asked.sum() + len(border) + np.arange((~asked).sum())
         row = np.empty(len(points), np.int64)
-        row[inside] = 2 * place[which] + panel[inside]
-        row[border] = 2 * (asked.sum() + np.arange(len(border))) + panel[border]
+        row[inside] = panels * place[which] + panel[inside]
+        row[border] = panels * (asked.sum() + np.arange(len(border))) + panel[border]
         counts = np.bincount(sewn.vertex_of_point)
 
         def index(a: np.ndarray) -> Tensor:
@@ -309,8 +316,7 @@ def load_isp(kind: str, folder: str | Path | None = None, device: str | torch.de
     """
     weights = read_weights(f"isp-{kind}", folder)
     try:
-        raw = dict(weights.card["shape"])
-        shape = IspShape(**{**raw, "seam_names": tuple(raw["seam_names"]), "centre": tuple(raw["centre"])})
+        shape = IspShape.read(weights.card["shape"])
         described = zip(weights.card["variants"], weights.card["parameters"], strict=True)
         decoder = build(shape, weights.tensors, [Variant(name, dict(values)) for name, values in described])
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

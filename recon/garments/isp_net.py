@@ -2,7 +2,7 @@
 
 The code modulates each layer (feature-wise scale and shift, FiLM); for a given code these fold into plain linear
 weights, so that decoding pays for an ordinary MLP. SiLU stands in for the paper's Softplus (several times cheaper on
-a CPU, as smooth), and front and back panel are outputs of one network instead of two.
+a CPU, as smooth), and all panels are outputs of one network instead of one each.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from recon.types import TWO_PANELS, behind
 
 CHUNK = 4096
 """Points per pass: the activations of one layer stay in a core's cache."""
@@ -118,38 +120,52 @@ class IspShape:
     half: float
     """Half the side of the domain [m]."""
     depth_offset: float = 0.13
-    """The flat start of the surface map: front panel at z = +offset, back panel at z = -offset [m]."""
+    """The flat start of the surface map: panels before the body at z = +offset, those behind it at -offset [m]."""
     code: int = 32
     width: int = 256
     pattern_depth: int = 4
     surface_depth: int = 6
     pattern_octaves: int = 4
     surface_octaves: int = 4
+    panel_names: tuple[str, ...] = TWO_PANELS
+    """Front and back, or more (ISP appendix C)."""
+
+    @staticmethod
+    def read(raw: dict) -> IspShape:
+        """From a card's JSON. TypeError or KeyError where it is none."""
+        lists = {k: tuple(v) for k, v in raw.items() if isinstance(v, list)}
+        return IspShape(**{**raw, **lists})
 
 
 class IspNets(nn.Module):
-    """I_Θ and A_Φ of one garment kind (ISP Eq. 1 and 3), front and back panel in one network each."""
+    """I_Θ and A_Φ of one garment kind (ISP Eq. 1 and 3), all K panels in one network each."""
+
+    depth: Tensor
 
     def __init__(self, shape: IspShape):
         super().__init__()
         self.shape = shape
-        labels = len(shape.seam_names)
-        self.pattern = FilmNet(2 + 2 * labels, shape.width, shape.pattern_depth, shape.code, shape.pattern_octaves)
-        self.surface = FilmNet(6, shape.width, shape.surface_depth, shape.code, shape.surface_octaves)
+        labels, panels = len(shape.seam_names), len(shape.panel_names)
+        fields = panels * (1 + labels)
+        self.pattern = FilmNet(fields, shape.width, shape.pattern_depth, shape.code, shape.pattern_octaves)
+        self.surface = FilmNet(3 * panels, shape.width, shape.surface_depth, shape.code, shape.surface_octaves)
+        away = shape.depth_offset / shape.half
+        depth = torch.tensor([-away if behind(name) else away for name in shape.panel_names])
+        self.register_buffer("depth", depth, persistent=False)
 
     def split_pattern(self, out: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw I_Θ output (..., 2 + 2L) -> signed distance (..., 2) [domain units], label logits (..., 2, L)."""
-        labels = len(self.shape.seam_names)
-        return out[..., :2], out[..., 2:].unflatten(-1, (2, labels))
+        """Raw I_Θ output (..., K + K L) -> signed distance (..., K) [domain units], label logits (..., K, L)."""
+        panels, labels = len(self.shape.panel_names), len(self.shape.seam_names)
+        return out[..., :panels], out[..., panels:].unflatten(-1, (panels, labels))
 
     def lift(self, out: Tensor, x: Tensor) -> Tensor:
-        """Raw A_Φ output (..., 6) at x (..., 2) -> (..., 2, 3) positions of front and back, domain units.
+        """Raw A_Φ output (..., 3 K) at x (..., 2) -> (..., K, 3) positions on each panel, domain units.
 
         The network learns the residual on the flat panel, which lies at the right place already.
         """
-        depth = self.shape.depth_offset / self.shape.half
-        flat = torch.stack([F.pad(x, (0, 1), value=depth), F.pad(x, (0, 1), value=-depth)], -2)
-        return flat + 0.2 * out.float().unflatten(-1, (2, 3))
+        flat = x[..., None, :].expand(*x.shape[:-1], len(self.depth), 2)
+        depth = self.depth[:, None].expand(*flat.shape[:-1], 1).to(flat.dtype)
+        return torch.cat([flat, depth], -1) + 0.2 * out.float().unflatten(-1, (len(self.depth), 3))
 
     def to_domain(self, panel: Tensor) -> Tensor:
         """(..., 2) panel coordinates [m] -> domain [-1, 1]²."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon.garments.panels import border_loops
-from recon.types import Garment, UserError
+from recon.types import Garment, UserError, behind
 
 Loop = NDArray[np.float64]
 ROOM = 0.02
@@ -55,12 +55,12 @@ def known_parameters(codes: Tensor, parameters: list[dict[str, float]], latent: 
 
 
 def panel_loops(garment: Garment) -> list[list[Loop]]:
-    """Outlines of front and back."""
+    """Outlines of each panel."""
     points = garment.panel_points.detach().cpu().double().numpy()
     panels = []
-    for panel in (0, 1):
+    for panel, name in enumerate(garment.panel_names):
         faces = garment.panel_faces[garment.panel_of_face == panel].cpu().numpy()
-        panels.append([points[loop] for loop in border_loops(faces if panel == 0 else faces[:, [0, 2, 1]])])
+        panels.append([points[loop] for loop in border_loops(faces[:, [0, 2, 1]] if behind(name) else faces)])
     return panels
 
 

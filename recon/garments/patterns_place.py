@@ -64,9 +64,9 @@ class BodyRelief:
         front, back = np.where(front < -10, -np.inf, front), np.where(back > 10, np.inf, back)
         return cls(origin, front, back, middle)
 
-    def thickness(self, panel: int, bridge: float) -> NDArray:
+    def thickness(self, side: int, bridge: float) -> NDArray:
         """(H, W) how far front (0) or back (1) stands out of the middle [m]; hollows up to ``bridge`` wide filled."""
-        out = self.front - self.middle if panel == 0 else self.middle - self.back
+        out = self.front - self.middle if side == 0 else self.middle - self.back
         out = np.where(np.isfinite(out), np.maximum(out, 0.0), 0.0)
         if bridge > 0:
             out = ndimage.grey_closing(out, size=(1, int(bridge / CELL)))
@@ -88,14 +88,17 @@ def place(pattern, measures: Measures, relief: BodyRelief) -> NDArray:
     # Legs and sleeves are tubes of their own; a skirt, a dress or a shirt spans what lies between two legs.
     bridge = 0.0 if pattern.kind == "trousers" else 0.26
     middle = relief.lookup(relief.middle, points)
-    seam_tree = cKDTree(pattern.points[pattern.seams[:, 0]])
+    # Depth closes where front and back are sewn together, not where two panels of one side are.
+    side = pattern.side_of_point
+    closing = side[pattern.seams[:, 0]] != side[pattern.seams[:, 1]]
+    seam_tree = cKDTree(pattern.points[pattern.seams[closing, 0]])
     distance, _ = seam_tree.query(pattern.points)
     q = np.clip(distance / 0.045, 0.0, 1.0)
     gap = GAP * np.sqrt(np.maximum(1 - (1 - q) ** 2, 0.0))
     z = np.empty(len(points))
-    for panel, sign in ((0, 1.0), (1, -1.0)):
-        mine = pattern.panel_of_point == panel
-        out = relief.lookup(relief.thickness(panel, bridge), points[mine])
+    for back, sign in ((0, 1.0), (1, -1.0)):
+        mine = side == back
+        out = relief.lookup(relief.thickness(back, bridge), points[mine])
         # A seam lies beside the body; where it does not (shoulders), the rise from it is quick but not a cliff.
         rise = np.clip(distance[mine] / 0.02, 0.0, 1.0)
         out = out * np.sqrt(np.maximum(1 - (1 - rise) ** 2, 0.0))

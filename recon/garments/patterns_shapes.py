@@ -1,6 +1,6 @@
 """The cuts themselves: outlines of tops, skirts, trousers and dresses from named sizes.
 
-An outline is the border of the front or back panel in the frontal plane of the T-posed body: x to the wearer's left,
+An outline is the border of a panel in the frontal plane of the T-posed body: x to the wearer's left,
 y up, metres. Left and right are mirror images, so only the left half is drawn.
 """
 
@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 from recon.garments.patterns_mesh import Edge
 
 Outline = dict[str, list[list[Edge]]]
-"""Panel name ("front", "back") -> its pieces (two where the front is cut open) -> their border, counter-clockwise."""
+"""Panel name ("front" ...) -> its pieces (two where the front is cut open) -> their border, counter-clockwise."""
 
 
 def bezier(*points: NDArray | Sequence[float], count: int = 33) -> NDArray:
@@ -71,6 +71,45 @@ def bodice(p: dict[str, float]) -> Outline:
             bottom = np.concatenate([(hem * [-1, 1])[::-1], hem[1:]])
             out[panel] = [[Edge("open", bottom), *edges, Edge("open", whole), *mirrored(edges)]]
     return out
+
+
+def set_in(p: dict[str, float]) -> Outline:
+    """Six-panel shirt (ISP appendix C): the bodice cut along its armholes, sleeves of a front and a back each.
+
+    Both sides of an armhole are the same curve in the plane, as seams of front and back are; the front's is deeper.
+    """
+    neck = np.array([p["neck_x"], p["neck_y"]])
+    side = bodice_side(p)
+    under, cuff, over = _sleeve(p, neck, side[-1])
+    tip = int(np.argmin(np.abs(over.line[:, 0] - p["shoulder_x"])))
+    hem = _hem(p, side[0])
+    bottom = np.concatenate([(hem * [-1, 1])[::-1], hem[1:]])
+    out: Outline = {}
+    for panel in ("front", "back"):
+        armhole = _armhole(side[-1], over.line[tip], p[f"armhole_{panel}"])
+        edges = [
+            Edge("side_left", side),
+            Edge(f"armhole_{panel}_left", armhole),
+            Edge("shoulder_left", over.line[tip:]),
+        ]
+        line = _neckline(neck, np.array([0.0, neck[1] - p[f"neck_depth_{panel}"]]), p["neck_v"] * (panel == "front"))
+        whole = np.concatenate([line, (line * [-1, 1])[::-1][1:]])
+        out[panel] = [[Edge("open", bottom), *edges, Edge("open", whole), *mirrored(edges)]]
+        sleeve = [
+            under,
+            cuff,
+            Edge("sleeve_over_left", over.line[: tip + 1]),
+            Edge(f"armhole_{panel}_left", armhole[::-1]),
+        ]
+        out[f"sleeve_{panel}_left"], out[f"sleeve_{panel}_right"] = [sleeve], [mirrored(sleeve)]
+    return out
+
+
+def _armhole(armpit: NDArray, tip: NDArray, depth: float) -> NDArray:
+    """From the armpit up to the shoulder's tip, ``depth`` [m] hollowed towards the body."""
+    inner = min(armpit[0], tip[0]) - depth
+    rise = tip[1] - armpit[1]
+    return bezier(armpit, [inner, armpit[1] + 0.25 * rise], [inner, armpit[1] + 0.7 * rise], tip)
 
 
 def bodice_side(p: dict[str, float]) -> NDArray:

@@ -47,6 +47,14 @@ def top(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     return p
 
 
+def set_in(style: str, rng: np.random.Generator, m: Measures) -> Parameters:
+    """Sizes of a shirt with set-in sleeves: those of a tshirt or shirt, and how far its armholes are hollowed [m]."""
+    p = top(style, rng, m)
+    p["armhole_back"] = rng.uniform(0.004, 0.012)
+    p["armhole_front"] = p["armhole_back"] + rng.uniform(0.0, 0.012)
+    return p
+
+
 def dress(rng: np.random.Generator, m: Measures) -> Parameters:
     """Sizes of a one-piece dress: sleeveless, short or long sleeves, mini to maxi, fitted to loose."""
     fit = rng.beta(1.0, 1.6)

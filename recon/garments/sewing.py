@@ -1,4 +1,4 @@
-"""Sew front and back panel along borders of equal label, by arc length (ISP B.2 puts strips of triangles between).
+"""Sew panels along borders of equal label, by arc length (ISP B.2 puts strips of triangles between).
 
 Each seam's two chains get the same number of points at the same relative arc lengths: points that nearly match move to
 their common place, the others are inserted on the other side. Each pair becomes one vertex of the garment.
@@ -6,210 +6,33 @@ their common place, the others are inserted on the other side. Each pair becomes
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from recon.garments.panels import Panel, border_edges, border_loops, corners, cross, move_safely
-
-SHORTEST_RUN = 0.025
-"""Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
-SLIT_SHARE = 0.8
-"""An open run within one seam and shorter than this share of each of its two parts is a wrong label."""
-CORNER_REACH = 0.03
-"""How far from a label change its corner is searched [domain units]."""
-MAX_CHAIN_DISTANCE = 0.15
-"""Front and back chain of a seam lie this close in the plane [domain units], or they don't belong together."""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """A stretch of one panel's border that carries one label."""
-
-    label: int
-    points: NDArray[np.int64]
-    """Panel point indices from end to end, both corners included."""
+from recon.garments.chains import Chain, arc_lengths, chains_of, merge_parameters, pair_chains, resampled
+from recon.garments.panels import Panel, border_edges, border_loops, corners, move_safely
 
 
 @dataclass(frozen=True)
 class Sewn:
-    """Both panels in one index space, sewn."""
+    """All panels in one index space, sewn."""
 
     points: NDArray[np.float64]
     """(P, 2) domain coordinates."""
     faces: NDArray[np.int64]
-    """(F, 3) panel indices; counter-clockwise in the plane for the front, clockwise for the back: seen from outside."""
+    """(F, 3) point indices; counter-clockwise in the plane before the body, clockwise behind it: seen from outside."""
     panel_of_face: NDArray[np.int64]
-    """(F,) 0 front, 1 back."""
+    """(F,) index of the panel."""
     vertex_of_point: NDArray[np.int64]
     """(P,) the welded vertex."""
     labels: NDArray[np.int64]
     """(P,) -1 inside, else the border label."""
-
-
-def clean_runs(labels: NDArray, lengths: NDArray) -> NDArray:
-    """Labels along a closed loop without runs shorter than ``SHORTEST_RUN``; lengths[i] joins vertex i to i + 1."""
-    labels = labels.copy()
-    while True:
-        starts = np.nonzero(labels != np.roll(labels, 1))[0]
-        if len(starts) < 2:
-            return labels
-        ends = np.roll(starts, -1)
-        total = np.concatenate([[0.0], np.cumsum(lengths)])
-        run = (total[ends] - total[starts]) % total[-1]
-        k = int(run.argmin())
-        if run[k] >= SHORTEST_RUN:
-            return labels
-        before, after = (k - 1) % len(starts), (k + 1) % len(starts)
-        winner = before if run[before] >= run[after] else after
-        index = np.arange(starts[k], ends[k] + (len(labels) if ends[k] <= starts[k] else 0)) % len(labels)
-        labels[index] = labels[starts[winner]]
-
-
-def without_slits(labels: NDArray, lengths: NDArray) -> NDArray:
-    """Labels along a closed loop in which no short open run lies within one seam: patterns have no such slits."""
-    labels = labels.copy()
-    total = np.concatenate([[0.0], np.cumsum(lengths)])
-    while True:
-        starts = np.nonzero(labels != np.roll(labels, 1))[0]
-        runs = labels[starts]
-        run = (total[np.roll(starts, -1)] - total[starts]) % total[-1]
-        beside = np.minimum(np.roll(run, 1), np.roll(run, -1))
-        short = (run < SLIT_SHARE * beside) & (beside > 4 * SHORTEST_RUN)
-        slits = np.nonzero((runs == 0) & (np.roll(runs, 1) == np.roll(runs, -1)) & short)[0]
-        if len(starts) < 3 or not len(slits):
-            return labels
-        first, last = starts[slits[0]], starts[(slits[0] + 1) % len(starts)]
-        index = np.arange(first, last + (len(labels) if last <= first else 0)) % len(labels)
-        labels[index] = labels[first - 1]
-
-
-def corner_near(points: NDArray, lengths: NDArray, change: int) -> int:
-    """The loop vertex near a label change (first vertex of the new run) where the border turns most."""
-    n = len(points)
-    near = [change]
-    for step in (-1, 1):
-        k, walked = change, 0.0
-        while len(near) < n:
-            walked += lengths[k if step > 0 else (k - 1) % n]
-            if walked > CORNER_REACH:
-                break
-            k = (k + step) % n
-            near.append(k)
-    window = np.array(near)
-    reach = max(1, min(3, int(round(0.02 / max(float(lengths.mean()), 1e-9)))))
-    before = points[window] - points[(window - reach) % n]
-    after = points[(window + reach) % n] - points[window]
-    turn = np.abs(np.arctan2(cross(before, after), (before * after).sum(1)))
-    away = np.abs((window - change + n // 2) % n - n // 2)
-    best = int((turn - 0.01 * away).argmax())
-    return int(window[best]) if turn[best] > np.radians(25) else change
-
-
-def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
-    """Seam chains of a panel and the border label of each of its points, from raw labels at its border vertices.
-
-    labels: (B,) in the order of ``panel.border``. Chains end at corners, which neighbouring chains share.
-    """
-    chains, per_point, offset = [], np.full(len(panel.points), -1), 0
-    for loop in panel.loops:
-        place = panel.points[loop]
-        lengths = np.linalg.norm(np.roll(place, -1, 0) - place, axis=1)
-        clean = without_slits(clean_runs(labels[offset : offset + len(loop)], lengths), lengths)
-        offset += len(loop)
-        per_point[loop] = 0
-        changes = np.nonzero(clean != np.roll(clean, 1))[0]
-        corners = [corner_near(place, lengths, int(k)) for k in changes]
-        for k, start in enumerate(corners):
-            end = corners[(k + 1) % len(corners)]
-            label = int(clean[changes[k]])
-            if label == 0 or start == end:
-                continue
-            index = np.arange(start, end + 1 + (len(loop) if end <= start else 0)) % len(loop)
-            chains.append(Chain(label, loop[index]))
-    chains = _without_scraps(panel, chains)
-    for chain in chains:
-        per_point[chain.points] = chain.label
-    return chains, per_point
-
-
-def _without_scraps(panel: Panel, chains: list[Chain]) -> list[Chain]:
-    """Chains without those far shorter than the longest one of their label: a seam's stray traces around a corner."""
-    length = [np.linalg.norm(np.diff(panel.points[c.points], axis=0), axis=1).sum() for c in chains]
-    longest: dict[int, float] = {}
-    for chain, own in zip(chains, length, strict=True):
-        longest[chain.label] = max(longest.get(chain.label, 0.0), own)
-    return [c for c, own in zip(chains, length, strict=True) if own > 0.25 * longest[c.label]]
-
-
-def arc_lengths(points: NDArray) -> NDArray:
-    """(N,) relative arc length in [0, 1] along a polyline."""
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    total = np.concatenate([[0.0], np.cumsum(steps)])
-    return total / max(total[-1], 1e-12)
-
-
-def _resample(points: NDArray, at: NDArray) -> NDArray:
-    t = arc_lengths(points)
-    return np.stack([np.interp(at, t, points[:, k]) for k in (0, 1)], 1)
-
-
-def pair_chains(front: Panel, back: Panel, fronts: list[Chain], backs: list[Chain]) -> list[tuple[Chain, Chain]]:
-    """Chains that belong together: equal label, nearest in the plane; back chains turned to run along the front's."""
-    at, pairs = np.linspace(0, 1, 9), []
-    for label in sorted({c.label for c in fronts} & {c.label for c in backs}):
-        a = [c for c in fronts if c.label == label]
-        b = [c for c in backs if c.label == label]
-        pa = np.stack([_resample(front.points[c.points], at) for c in a])
-        pb = np.stack([_resample(back.points[c.points], at) for c in b])
-        straight = np.linalg.norm(pa[:, None] - pb[None], axis=-1).mean(-1)
-        turned = np.linalg.norm(pa[:, None] - pb[None, :, ::-1], axis=-1).mean(-1)
-        cost = np.minimum(straight, turned)
-        for i, j in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[i, j] > MAX_CHAIN_DISTANCE:
-                continue
-            turn = turned[i, j] < straight[i, j]
-            pairs.append((a[i], Chain(label, b[j].points[::-1]) if turn else b[j]))
-    return pairs
-
-
-def merge_parameters(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Common arc lengths of two chains: (t, index in a or -1, index in b or -1), ends matched to ends.
-
-    Interior points closer than ``tolerance`` share their mean; the others stay alone.
-    """
-    inner = [np.arange(1, len(side) - 1) for side in (a, b)]
-    i, j = _mutual(a[inner[0]], b[inner[1]], tolerance)
-    i, j = i + 1, j + 1
-    alone = [np.setdiff1d(of, used, assume_unique=True) for of, used in zip(inner, (i, j))]
-    t = np.concatenate([[0.0, 1.0], 0.5 * (a[i] + b[j]), a[alone[0]], b[alone[1]]])
-    none = [np.full(len(k), -1) for k in alone]
-    ia = np.concatenate([[0, len(a) - 1], i, alone[0], none[1]])
-    ib = np.concatenate([[0, len(b) - 1], j, none[0], alone[1]])
-    order = np.argsort(t, kind="stable")
-    order = np.concatenate([[0], order[(order != 0) & (order != 1)], [1]])  # the ends stay the ends
-    return t[order], ia[order], ib[order]
-
-
-def _mutual(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray]:
-    """Pairs (rows of a, rows of b) of rising numbers that are each other's nearest and closer than ``tolerance``."""
-    if not len(a) or not len(b):
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    to_b, to_a = _nearest(a, b), _nearest(b, a)
-    rows = np.nonzero((to_a[to_b] == np.arange(len(a))) & (np.abs(b[to_b] - a) <= tolerance))[0]
-    return rows, to_b[rows]
-
-
-def _nearest(x: NDArray, among: NDArray) -> NDArray[np.int64]:
-    """(N,) rows of the rising numbers ``among`` that are nearest to x (N,)."""
-    last = len(among) - 1
-    after = np.searchsorted(among, x).clip(0, last)
-    before = (after - 1).clip(0)
-    return np.where(np.abs(among[before] - x) <= np.abs(among[after] - x), before, after)
 
 
 class _Growing:
@@ -260,7 +83,7 @@ class _Growing:
 
     def thread(self, chain: Chain, t: NDArray, index: NDArray) -> NDArray:
         """Bring the chain to the arc lengths t; index says which of its points each is (-1: inserted)."""
-        place = _resample(self.panel.points[chain.points], t)
+        place = resampled(self.panel.points[chain.points], t)
         row = np.where(index >= 0, chain.points[index], -1)
         coming = row.copy()  # the chain's own point at or after each place
         for k in range(len(row) - 2, -1, -1):
@@ -317,45 +140,68 @@ def split_chords(points: NDArray, faces: NDArray, labels: NDArray) -> tuple[NDAr
     return points, faces, labels
 
 
-def sew(front: Panel, back: Panel, front_labels: NDArray, back_labels: NDArray, spacing: float) -> Sewn:
-    """Sew two flat panels; labels are raw, per border vertex; ``spacing`` is the grid's cell edge [domain units]."""
-    front_chains, front_points = chains_of(front, front_labels)
-    back_chains, back_points = chains_of(back, back_labels)
-    pairs = pair_chains(front, back, front_chains, back_chains)
-    for chains, labels, used in (
-        (front_chains, front_points, [a.points for a, _ in pairs]),
-        (back_chains, back_points, [b.points for _, b in pairs]),
-    ):
+def sew(panels: Sequence[Panel], labels: Sequence[NDArray], turned: Sequence[bool], spacing: float) -> Sewn:
+    """Sew flat panels; any two are sewn where both have a border of one label.
+
+    Args:
+        panels: in the plane that they share.
+        labels: raw, per border vertex of each panel.
+        turned: which panels lie behind the body: their faces are turned over.
+        spacing: the grid's cell edge [domain units].
+    """
+    found = [chains_of(panel, own) for panel, own in zip(panels, labels, strict=True)]
+    pairs = [
+        (i, j, a, b)
+        for i, j in combinations(range(len(panels)), 2)
+        for a, b in pair_chains(panels[i], panels[j], found[i][0], found[j][0])
+    ]
+    grown = []
+    for k, (panel, (chains, per_point)) in enumerate(zip(panels, found, strict=True)):
+        used = [a.points for i, _, a, _ in pairs if i == k] + [b.points for _, j, _, b in pairs if j == k]
         sewn_points = np.concatenate(used) if used else np.zeros(0, np.int64)
         for chain in chains:  # chains without a partner stay open
-            labels[np.setdiff1d(chain.points, sewn_points)] = 0
-    grown = _Growing(front, front_points), _Growing(back, back_points)
+            per_point[np.setdiff1d(chain.points, sewn_points)] = 0
+        grown.append(_Growing(panel, per_point))
     seams = []
-    for a, b in pairs:
-        ta = arc_lengths(front.points[a.points])
-        tb = arc_lengths(back.points[b.points])
-        length = np.linalg.norm(np.diff(front.points[a.points], axis=0), axis=1).sum()
+    for i, j, a, b in pairs:
+        ta = arc_lengths(panels[i].points[a.points])
+        tb = arc_lengths(panels[j].points[b.points])
+        length = np.linalg.norm(np.diff(panels[i].points[a.points], axis=0), axis=1).sum()
         t, ia, ib = merge_parameters(ta, tb, 0.45 * spacing / max(length, spacing))
-        seams.append((grown[0].thread(a, t, ia), grown[1].thread(b, t, ib)))
-    parts = [split_chords(*growing.finish()) for growing in grown]
-    return _weld(parts, seams)
+        seams.append(((i, grown[i].thread(a, t, ia)), (j, grown[j].thread(b, t, ib))))
+    return _weld([split_chords(*growing.finish()) for growing in grown], seams, turned)
 
 
-def _weld(parts: list, seams: list[tuple[NDArray, NDArray]]) -> Sewn:
-    """One index space, back faces turned outward, and one vertex per pair of seam points."""
-    (p0, f0, l0), (p1, f1, l1) = parts
-    n0, count = len(p0), len(p0) + len(p1)
-    one = np.concatenate([a for a, _ in seams]) if seams else np.zeros(0, np.int64)
-    other = np.concatenate([b for _, b in seams]) + n0 if seams else np.zeros(0, np.int64)
-    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), shape=(count, count))
+_Side = tuple[int, NDArray]
+"""A panel and points of it along a seam."""
+
+
+def _weld(parts: list, seams: list[tuple[_Side, _Side]], turned: Sequence[bool]) -> Sewn:
+    """One index space, turned panels' faces turned outward, and one vertex per pair of seam points."""
+    first = np.cumsum([0, *(len(points) for points, _, _ in parts)])
+    sides = [[side[k][1] + first[side[k][0]] for side in seams] for k in (0, 1)]
+    one, other = (np.concatenate(side) if side else np.zeros(0, np.int64) for side in sides)
+    graph = coo_matrix((np.ones(len(one), np.int8), (one, other)), shape=(first[-1], first[-1]))
     vertex = connected_components(graph, directed=False)[1].astype(np.int64)
+    faces = [f[:, [0, 2, 1]] if over else f for (_, f, _), over in zip(parts, turned, strict=True)]
     return Sewn(
-        points=np.concatenate([p0, p1]),
-        faces=np.concatenate([f0, f1[:, [0, 2, 1]] + n0]),
-        panel_of_face=np.concatenate([np.zeros(len(f0), np.int64), np.ones(len(f1), np.int64)]),
+        points=np.concatenate([points for points, _, _ in parts]),
+        faces=np.concatenate([f + start for f, start in zip(faces, first, strict=False)]),
+        panel_of_face=np.repeat(np.arange(len(faces)), [len(f) for f in faces]),
         vertex_of_point=vertex,
-        labels=np.concatenate([l0, l1]),
+        labels=np.concatenate([own for _, _, own in parts]),
     )
+
+
+def sewn_to(vertex_of_point: NDArray) -> NDArray:
+    """(P,) for each panel point the next one of its welded vertex, in a cycle; itself where it is alone."""
+    order = np.argsort(vertex_of_point, kind="stable")
+    _, first, count = np.unique(vertex_of_point[order], return_index=True, return_counts=True)
+    ahead = np.roll(order, -1)
+    ahead[first + count - 1] = order[first]
+    partner = np.empty(len(order), np.int64)
+    partner[order] = ahead
+    return partner
 
 
 def garment_loops(mesh_faces: NDArray) -> list[NDArray]:

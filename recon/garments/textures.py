@@ -1,4 +1,4 @@
-"""Textures drawn on panels (ISP A.1): one square a panel, shared by all garments of a kind.
+"""Textures drawn on panels (ISP A.1): one square a side of the body, shared by all garments of a kind.
 
 The image is twice as wide as high: the front's domain left, the back's right, both as seen from outside and upright.
 Since panels of all garments lie in one domain, a drawing on one garment's panels is at its place on every other's.
@@ -39,16 +39,9 @@ class Sheet:
     def coordinates(self, garment: Garment) -> Tensor:
         """(P, 2) place of each panel point in the image, both in [0, 1]: from the left, from the top."""
         x, y = ((garment.panel_points.detach() - garment.panel_points.new_tensor(self.centre)) / self.half).unbind(1)
-        back = on_back(garment)
+        back = garment.side_of_point == 1
         across = torch.where(back, 0.75 - x / 4, 0.25 + x / 4)  # the back is seen from behind
         return torch.stack([across, 0.5 - y / 2], 1)
-
-
-def on_back(garment: Garment) -> Tensor:
-    """(P,) bool, which points are the back panel's."""
-    back = torch.zeros(len(garment.panel_points), dtype=torch.bool)
-    back[garment.panel_faces[garment.panel_of_face == 1]] = True
-    return back
 
 
 def colours_at(texture: Tensor, coordinates: Tensor) -> Tensor:
@@ -64,10 +57,10 @@ def unsewn(garment: Garment) -> Mesh:
 
 
 def template(garment: Garment, sheet: Sheet) -> NDArray[np.uint8]:
-    """(SIDE, 2 SIDE, 3) BGR: both panels' outlines, to be drawn on."""
+    """(SIDE, 2 SIDE, 3) BGR: all panels' outlines, to be drawn on."""
     image = np.full((SIDE, 2 * SIDE, 3), 255, np.uint8)
     pixels = sheet.coordinates(garment).numpy() * [2 * SIDE, SIDE]
-    for panel in (0, 1):
+    for panel in range(len(garment.panel_names)):
         mask = np.zeros(image.shape[:2], np.uint8)
         for triangle in pixels[garment.panel_faces[garment.panel_of_face == panel].numpy()]:
             cv2.fillConvexPoly(mask, np.round(triangle * 16).astype(np.int32), 255, shift=4)

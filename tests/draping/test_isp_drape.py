@@ -18,7 +18,7 @@ from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.drapenet import DrapeNets, DrapeShape
 from recon.draping.isp import DisplacementNet, DisplacementShape, IspDraper, load_isp_draper, pose_features
 from recon.draping.layering import load_layering
-from recon.draping.uv import Box, panel_of_point
+from recon.draping.uv import Box
 from recon.files.weights import write_weights
 from recon.garments import load_decoder
 from recon.types import BodyPose, UserError
@@ -97,8 +97,8 @@ def test_the_same_garment_on_a_finer_mesh_drapes_alike(body, skirt) -> None:
     decoder = load_decoder("skirt")
     with torch.no_grad():
         fine = decoder.decode(decoder.codes[3], 80)  # its grid holds the coarse one's
-    inner = (skirt.border_labels < 0) & (panel_of_point(skirt) == 0)
-    front = (panel_of_point(fine) == 0).nonzero()[:, 0]
+    inner = (skirt.border_labels < 0) & (skirt.side_of_point == 0)
+    front = (fine.side_of_point == 0).nonzero()[:, 0]
     apart, at_fine = torch.cdist(skirt.panel_points[inner], fine.panel_points[front]).min(1)
     coarse, dense = draper.drape(skirt, at).vertices[0], draper.drape(fine, at).vertices[0]
     coarse, dense = coarse[skirt.vertex_of_point[inner]], dense[fine.vertex_of_point[front[at_fine]]]

@@ -15,7 +15,6 @@ from recon.draping.uv import (
     levels,
     map_size,
     modes,
-    panel_of_point,
     point_areas,
     rest_features,
     splat,
@@ -59,7 +58,7 @@ def test_welding_takes_the_mean_at_seams(flat_shirt) -> None:
     welding = Welding.of(garment)
     at_points = garment.mesh.vertices[garment.vertex_of_point]
     torch.testing.assert_close(welding(at_points), garment.mesh.vertices)
-    panel = panel_of_point(garment)
+    panel = garment.side_of_point
     share = welding(panel[:, None].float())[:, 0]
     assert set(share.unique().tolist()) == {0.0, 0.5, 1.0}  # front, seams, back
 

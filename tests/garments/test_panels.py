@@ -3,20 +3,12 @@
 import numpy as np
 import pytest
 
+from recon.garments.chains import arc_lengths, chains_of, clean_runs, merge_parameters, pair_chains, without_slits
 from recon.garments.dataset import load_garments
 from recon.garments.panels import border_loops, cut_panel, grid_axis, move_safely, signed_areas, waistband
-from recon.garments.sewing import (
-    arc_lengths,
-    chains_of,
-    clean_runs,
-    garment_loops,
-    is_manifold,
-    merge_parameters,
-    pair_chains,
-    sew,
-    split_chords,
-    without_slits,
-)
+from recon.garments.sewing import garment_loops, is_manifold, sew, split_chords
+
+TURNED = [False, True]
 
 
 def grid(resolution):
@@ -135,7 +127,7 @@ def side_labels(panel):
 def test_two_sheets_sewn_at_the_sides_make_a_tube(resolution, shift):
     front = cut_panel(box(grid(resolution), 0.5, 0.6))
     back = cut_panel(box(grid(resolution), 0.5 + shift, 0.6 - shift))
-    sewn = sew(front, back, side_labels(front), side_labels(back), 2 / resolution)
+    sewn = sew([front, back], [side_labels(front), side_labels(back)], TURNED, 2 / resolution)
     faces = sewn.vertex_of_point[sewn.faces]
     assert is_manifold(faces)
     assert len(garment_loops(faces)) == 2
@@ -154,7 +146,7 @@ def test_an_open_front_gives_three_borders_less_one():
     x = grid(96)
     front = cut_panel(np.maximum(box(x, 0.5, 0.6), -box(x, 0.04, 2.0)))
     back = cut_panel(box(x, 0.5, 0.6))
-    sewn = sew(front, back, side_labels(front), side_labels(back), 2 / 96)
+    sewn = sew([front, back], [side_labels(front), side_labels(back)], TURNED, 2 / 96)
     faces = sewn.vertex_of_point[sewn.faces]
     assert is_manifold(faces) and len(garment_loops(faces)) == 1
 
@@ -166,7 +158,7 @@ def test_label_noise_does_not_tear_a_seam(noise):
     labels = [side_labels(p) for p in (front, back)]
     for values in labels:
         values[rng.random(len(values)) < noise] = rng.integers(3)
-    sewn = sew(front, back, *labels, 2 / 64)
+    sewn = sew([front, back], labels, TURNED, 2 / 64)
     faces = sewn.vertex_of_point[sewn.faces]
     assert is_manifold(faces) and len(garment_loops(faces)) == 2
 
@@ -175,7 +167,7 @@ def test_a_seam_without_partner_stays_open():
     front, back = cut_panel(box(grid(64), 0.5, 0.6)), cut_panel(box(grid(64), 0.5, 0.6))
     one_sided = side_labels(back)
     one_sided[one_sided == 1] = 0
-    sewn = sew(front, back, side_labels(front), one_sided, 2 / 64)
+    sewn = sew([front, back], [side_labels(front), one_sided], TURNED, 2 / 64)
     faces = sewn.vertex_of_point[sewn.faces]
     assert is_manifold(faces) and len(garment_loops(faces)) == 1
     assert not (sewn.labels == 1).any()

@@ -10,7 +10,7 @@ import trimesh
 
 from pipelines.decode import Decode, decode
 from recon.files.textures import read_texture, write_png
-from recon.garments.textures import SIDE, Sheet, colours_at, on_back, template, unsewn
+from recon.garments.textures import SIDE, Sheet, colours_at, template, unsewn
 from recon.types import UserError
 
 SHEET = Sheet((0.0, 0.35), 0.5)
@@ -26,7 +26,7 @@ def gradient(h: int = 64) -> torch.Tensor:
 def test_front_lies_left_and_back_right_seen_from_outside(flat_shirt):
     shirt = flat_shirt(0.05)
     at = SHEET.coordinates(shirt)
-    back = on_back(shirt)
+    back = shirt.side_of_point == 1
     assert bool((at[~back, 0] <= 0.5).all()) and bool((at[back, 0] >= 0.5).all())
     left = shirt.panel_points[:, 0].argmax()  # the wearer's left: right in front, left behind
     assert at[~back, 0].max() == pytest.approx(0.25 + 0.3 / 0.5 / 4) and not back[left]

@@ -1,0 +1,191 @@
+"""Chains: the stretches of panels' borders that carry one label, and which of them belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from recon.garments.panels import Panel, cross
+
+SHORTEST_RUN = 0.025
+"""Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
+SLIT_SHARE = 0.8
+"""An open run within one seam and shorter than this share of each of its two parts is a wrong label."""
+CORNER_REACH = 0.03
+"""How far from a label change its corner is searched [domain units]."""
+MAX_CHAIN_DISTANCE = 0.15
+"""Both chains of a seam lie this close in the plane [domain units], or they don't belong together."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A stretch of one panel's border that carries one label."""
+
+    label: int
+    points: NDArray[np.int64]
+    """Panel point indices from end to end, both corners included."""
+
+
+def clean_runs(labels: NDArray, lengths: NDArray) -> NDArray:
+    """Labels along a closed loop without runs shorter than ``SHORTEST_RUN``; lengths[i] joins vertex i to i + 1."""
+    labels = labels.copy()
+    while True:
+        starts = np.nonzero(labels != np.roll(labels, 1))[0]
+        if len(starts) < 2:
+            return labels
+        ends = np.roll(starts, -1)
+        total = np.concatenate([[0.0], np.cumsum(lengths)])
+        run = (total[ends] - total[starts]) % total[-1]
+        k = int(run.argmin())
+        if run[k] >= SHORTEST_RUN:
+            return labels
+        before, after = (k - 1) % len(starts), (k + 1) % len(starts)
+        winner = before if run[before] >= run[after] else after
+        index = np.arange(starts[k], ends[k] + (len(labels) if ends[k] <= starts[k] else 0)) % len(labels)
+        labels[index] = labels[starts[winner]]
+
+
+def without_slits(labels: NDArray, lengths: NDArray) -> NDArray:
+    """Labels along a closed loop in which no short open run lies within one seam: patterns have no such slits."""
+    labels = labels.copy()
+    total = np.concatenate([[0.0], np.cumsum(lengths)])
+    while True:
+        starts = np.nonzero(labels != np.roll(labels, 1))[0]
+        runs = labels[starts]
+        run = (total[np.roll(starts, -1)] - total[starts]) % total[-1]
+        beside = np.minimum(np.roll(run, 1), np.roll(run, -1))
+        short = (run < SLIT_SHARE * beside) & (beside > 4 * SHORTEST_RUN)
+        slits = np.nonzero((runs == 0) & (np.roll(runs, 1) == np.roll(runs, -1)) & short)[0]
+        if len(starts) < 3 or not len(slits):
+            return labels
+        first, last = starts[slits[0]], starts[(slits[0] + 1) % len(starts)]
+        index = np.arange(first, last + (len(labels) if last <= first else 0)) % len(labels)
+        labels[index] = labels[first - 1]
+
+
+def corner_near(points: NDArray, lengths: NDArray, change: int) -> int:
+    """The loop vertex near a label change (first vertex of the new run) where the border turns most."""
+    n = len(points)
+    near = [change]
+    for step in (-1, 1):
+        k, walked = change, 0.0
+        while len(near) < n:
+            walked += lengths[k if step > 0 else (k - 1) % n]
+            if walked > CORNER_REACH:
+                break
+            k = (k + step) % n
+            near.append(k)
+    window = np.array(near)
+    reach = max(1, min(3, int(round(0.02 / max(float(lengths.mean()), 1e-9)))))
+    before = points[window] - points[(window - reach) % n]
+    after = points[(window + reach) % n] - points[window]
+    turn = np.abs(np.arctan2(cross(before, after), (before * after).sum(1)))
+    away = np.abs((window - change + n // 2) % n - n // 2)
+    best = int((turn - 0.01 * away).argmax())
+    return int(window[best]) if turn[best] > np.radians(25) else change
+
+
+def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
+    """Seam chains of a panel and the border label of each of its points, from raw labels at its border vertices.
+
+    labels: (B,) in the order of ``panel.border``. Chains end at corners, which neighbouring chains share.
+    """
+    chains, per_point, offset = [], np.full(len(panel.points), -1), 0
+    for loop in panel.loops:
+        place = panel.points[loop]
+        lengths = np.linalg.norm(np.roll(place, -1, 0) - place, axis=1)
+        clean = without_slits(clean_runs(labels[offset : offset + len(loop)], lengths), lengths)
+        offset += len(loop)
+        per_point[loop] = 0
+        changes = np.nonzero(clean != np.roll(clean, 1))[0]
+        corners = [corner_near(place, lengths, int(k)) for k in changes]
+        for k, start in enumerate(corners):
+            end = corners[(k + 1) % len(corners)]
+            label = int(clean[changes[k]])
+            if label == 0 or start == end:
+                continue
+            index = np.arange(start, end + 1 + (len(loop) if end <= start else 0)) % len(loop)
+            chains.append(Chain(label, loop[index]))
+    chains = _without_scraps(panel, chains)
+    for chain in chains:
+        per_point[chain.points] = chain.label
+    return chains, per_point
+
+
+def _without_scraps(panel: Panel, chains: list[Chain]) -> list[Chain]:
+    """Chains without those far shorter than the longest one of their label: a seam's stray traces around a corner."""
+    length = [np.linalg.norm(np.diff(panel.points[c.points], axis=0), axis=1).sum() for c in chains]
+    longest: dict[int, float] = {}
+    for chain, own in zip(chains, length, strict=True):
+        longest[chain.label] = max(longest.get(chain.label, 0.0), own)
+    return [c for c, own in zip(chains, length, strict=True) if own > 0.25 * longest[c.label]]
+
+
+def arc_lengths(points: NDArray) -> NDArray:
+    """(N,) relative arc length in [0, 1] along a polyline."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    total = np.concatenate([[0.0], np.cumsum(steps)])
+    return total / max(total[-1], 1e-12)
+
+
+def resampled(points: NDArray, at: NDArray) -> NDArray:
+    """(N, 2) points of a polyline at relative arc lengths (N,)."""
+    t = arc_lengths(points)
+    return np.stack([np.interp(at, t, points[:, k]) for k in (0, 1)], 1)
+
+
+def pair_chains(one: Panel, other: Panel, ones: list[Chain], others: list[Chain]) -> list[tuple[Chain, Chain]]:
+    """Chains of two panels that belong together: equal label, nearest in the plane; the other's turned to run along."""
+    at, pairs = np.linspace(0, 1, 9), []
+    for label in sorted({c.label for c in ones} & {c.label for c in others}):
+        a = [c for c in ones if c.label == label]
+        b = [c for c in others if c.label == label]
+        pa = np.stack([resampled(one.points[c.points], at) for c in a])
+        pb = np.stack([resampled(other.points[c.points], at) for c in b])
+        straight = np.linalg.norm(pa[:, None] - pb[None], axis=-1).mean(-1)
+        turned = np.linalg.norm(pa[:, None] - pb[None, :, ::-1], axis=-1).mean(-1)
+        cost = np.minimum(straight, turned)
+        for i, j in zip(*linear_sum_assignment(cost), strict=True):
+            if cost[i, j] > MAX_CHAIN_DISTANCE:
+                continue
+            turn = turned[i, j] < straight[i, j]
+            pairs.append((a[i], Chain(label, b[j].points[::-1]) if turn else b[j]))
+    return pairs
+
+
+def merge_parameters(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray, NDArray]:
+    """Common arc lengths of two chains: (t, index in a or -1, index in b or -1), ends matched to ends.
+
+    Interior points closer than ``tolerance`` share their mean; the others stay alone.
+    """
+    inner = [np.arange(1, len(side) - 1) for side in (a, b)]
+    i, j = _mutual(a[inner[0]], b[inner[1]], tolerance)
+    i, j = i + 1, j + 1
+    alone = [np.setdiff1d(of, used, assume_unique=True) for of, used in zip(inner, (i, j))]
+    t = np.concatenate([[0.0, 1.0], 0.5 * (a[i] + b[j]), a[alone[0]], b[alone[1]]])
+    none = [np.full(len(k), -1) for k in alone]
+    ia = np.concatenate([[0, len(a) - 1], i, alone[0], none[1]])
+    ib = np.concatenate([[0, len(b) - 1], j, none[0], alone[1]])
+    order = np.argsort(t, kind="stable")
+    order = np.concatenate([[0], order[(order != 0) & (order != 1)], [1]])  # the ends stay the ends
+    return t[order], ia[order], ib[order]
+
+
+def _mutual(a: NDArray, b: NDArray, tolerance: float) -> tuple[NDArray, NDArray]:
+    """Pairs (rows of a, rows of b) of rising numbers that are each other's nearest and closer than ``tolerance``."""
+    if not len(a) or not len(b):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    to_b, to_a = _nearest(a, b), _nearest(b, a)
+    rows = np.nonzero((to_a[to_b] == np.arange(len(a))) & (np.abs(b[to_b] - a) <= tolerance))[0]
+    return rows, to_b[rows]
+
+
+def _nearest(x: NDArray, among: NDArray) -> NDArray[np.int64]:
+    """(N,) rows of the rising numbers ``among`` that are nearest to x (N,)."""
+    last = len(among) - 1
+    after = np.searchsorted(among, x).clip(0, last)
+    before = (after - 1).clip(0)
+    return np.where(np.abs(among[before] - x) <= np.abs(among[after] - x), before, after)
