@@ -40,7 +40,10 @@ class Truth:
 
     photo: Photo
     meshes: dict[str, Mesh]
+    """Garments as worn, outermost first."""
+    body: Mesh
     pelvis: Tensor
+    camera: Camera
 
 
 def random_body(models: Models, generator: torch.Generator) -> BodyPose:
@@ -75,7 +78,8 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
             name: Mesh(torch.from_numpy(x).float(), g.mesh.faces)
             for name, x, g in zip(outfit, worn, garments, strict=True)
         }
-        parts = [*meshes.values(), Mesh(posed.mesh.vertices[0], models.body.faces)]
+        skin = Mesh(posed.mesh.vertices[0], models.body.faces)
+        parts = [*meshes.values(), skin]
         renderer = models.renderer_of(
             [m.faces for m in parts], list(range(len(parts))), [len(m.vertices) for m in parts]
         )
@@ -93,7 +97,30 @@ def make_truth(outfit: tuple[str, ...], number: int, models: Models) -> Truth:
         landmarks=torch.cat([pixels + noise, torch.ones(33, 1)], 1),
         landmarks_world=world,
     )
-    return Truth(photo, meshes, posed.joints[0, 0])
+    return Truth(photo, meshes, skin, posed.joints[0, 0], camera)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A fit of a made photo, moved so that its pelvis is where the true one is: a photo leaves the depth open."""
+
+    meshes: dict[str, Mesh]
+    body: Mesh
+    iou: dict[str, float]
+    """Garment name -> overlap with its mask, as seen by the camera that was found."""
+
+
+def fit_truth(truth: Truth, number: int, models: Models, config: PhotoFit) -> Found:
+    """Fit one made photo as ``recon photo`` does after perception; stages are kept in ``config.out``."""
+    run = Run(config.out, {"truth": number})
+    values, layers, meshes = fit_evidence(truth.photo, models, config, run)
+    at = level(truth.photo, 512).pick(tuple(layer.name for layer in layers))
+    iou = overlaps(meshes, values, truth.photo, models, at)
+    with torch.no_grad():
+        posed = models.body.pose(to_body(values))
+        shift = truth.pelvis - posed.joints[0, 0]
+    moved = {name: mesh.with_vertices(mesh.vertices + shift) for name, mesh in meshes.items()}
+    return Found(moved, Mesh(posed.mesh.vertices[0] + shift, models.body.faces), iou)
 
 
 def run_truth(cases: int, out: Path) -> Iterator[dict]:
@@ -111,16 +138,10 @@ def run_truth(cases: int, out: Path) -> Iterator[dict]:
         truth = make_truth(OUTFITS[number % len(OUTFITS)], number, models)
         folder = out / f"truth-{number}"
         shutil.rmtree(folder, ignore_errors=True)
-        run = Run(folder, {"truth": number})
-        values, layers, meshes = fit_evidence(truth.photo, models, replace(config, out=folder), run)
-        at = level(truth.photo, 512).pick(tuple(layer.name for layer in layers))
-        iou = overlaps(meshes, values, truth.photo, models, at)
-        with torch.no_grad():
-            shift = truth.pelvis - models.body.pose(to_body(values)).joints[0, 0]
-        for name, mesh in meshes.items():
-            moved = mesh.with_vertices(mesh.vertices + shift)
-            distance = compare_meshes(moved, truth.meshes[name], torch.Generator().manual_seed(0))["surface_mm"]
-            rows.append({"case": number, "garment": name, "iou": iou[name], "chamfer_mm": float(distance)})
+        found = fit_truth(truth, number, models, replace(config, out=folder))
+        for name, mesh in found.meshes.items():
+            distance = compare_meshes(mesh, truth.meshes[name], torch.Generator().manual_seed(0))["surface_mm"]
+            rows.append({"case": number, "garment": name, "iou": found.iou[name], "chamfer_mm": float(distance)})
             print(rows[-1], flush=True)
         yield {"rows": rows, "kinds": summary(rows)}
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Annotated
 
 import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 import tyro
 from torch import Tensor
 
@@ -41,6 +43,9 @@ class GarmentFit:
     """Longer side of retrieval's silhouettes."""
     retrieval_round: int = 60
     """Codes that retrieval's first round compares; its second compares as many neighbours of the best."""
+    alike: float = 0.05
+    """Beneath other garments, codes that overlap the mask less than the best by no more than this count as alike: what
+    is hidden begins as in the middle of them, neither sleeveless nor long-sleeved under a jacket."""
     starts: int = 2
     """How many of the best retrieved codes get a first, coarse descent; the best goes on."""
     refresh: int = 5
@@ -97,6 +102,8 @@ class Models:
         return getattr(self.draper, "skinning", self.draper)
 
 
+SPILL = 0.03
+"""How far beyond an outer garment's mask retrieval lets an inner one be seen [of the silhouettes' longer side]."""
 BODY_SIZES = {"shape": 0.01, "pose": 0.006, "translation": 0.003, "log_focal": 0.002, "pitch": 0.002}
 """Step sizes of body and camera while a code descends: they only settle."""
 ANCHOR_UNITS = {"shape": 0.5, "pose": 0.1, "translation": 0.02, "log_focal": 0.1, "pitch": 0.05}
@@ -121,13 +128,36 @@ def retrieve(
 ) -> Tensor:
     """(n,) codes by the overlap of their draped silhouettes with the mask, best first (see ``codes.retrieved``).
 
-    Pixels under an outer garment's mask count neither for nor against, like hair and hands.
+    Pixels under an outer garment's mask, and others close to it, count neither for nor against, like hair and hands.
     """
     decoder = models.decoders[name]
     with torch.no_grad():
-        score = _silhouette_score(name, values, photo, models, settings)
+        score = cache(_silhouette_score(name, values, photo, models, settings))
         allowed = of_variants(decoder.variants, models.variants[name])
-        return retrieved(decoder.codes, allowed, score, settings.retrieval_round, tick)
+        found = retrieved(decoder.codes, allowed, score, settings.retrieval_round, tick)
+        if name == next(iter(photo.garments)):  # nothing of the outermost is hidden
+            return found
+        return middle_first(decoder.codes, found, torch.tensor([score(int(i)) for i in found]), settings.alike)
+
+
+def hidden(outer: Tensor, own: Tensor, reach: int) -> Tensor:
+    """(h, w) in [0, 1]: what masks (L, h, w) of outer garments hide of the one with mask ``own`` (h, w).
+
+    Up to ``reach`` pixels beside them as well, but for its own mask: a sleeve that looks out beyond the jacket's by a
+    little, because body and cloth are not settled yet, is no reason to leave it away.
+    """
+    if not len(outer):
+        return torch.zeros_like(own)
+    over = outer.sum(0).clamp(0, 1)
+    around = F.max_pool2d(over[None], 2 * reach + 1, 1, reach)[0]
+    return torch.where(own > 0.5, over, around)
+
+
+def middle_first(codes: Tensor, found: Tensor, scores: Tensor, alike: float) -> Tensor:
+    """Indices ``found`` (n,) of codes, best first, those within ``alike`` of the best ordered from their middle out."""
+    close = scores >= scores[0] - alike
+    away = (codes[found[close]] - codes[found[close]].mean(0)).norm(dim=1)
+    return torch.cat([found[close][away.argsort(stable=True)], found[~close]])
 
 
 def _silhouette_score(
@@ -136,7 +166,7 @@ def _silhouette_score(
     """A function from a code's index to its silhouette's overlap with the mask."""
     at = level(photo, settings.retrieval_pixels)
     mine = at.names.index(name)
-    weight = at.weight * (1 - at.targets[:mine].sum(0).clamp(0, 1))
+    weight = at.weight * (1 - hidden(at.targets[:mine], at.targets[mine], round(SPILL * settings.retrieval_pixels)))
     camera = at.camera(to_camera(values, photo_size(photo)))
     decoder = models.decoders[name]
     posed = models.body.pose(to_body(values))
