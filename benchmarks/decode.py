@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from recon.garments import KINDS, load_decoder
+from recon.garments import COMMON, load_decoder
 
 RESOLUTIONS = (128, 256, 512)
 
@@ -79,7 +79,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
+    parser.add_argument("--kinds", nargs="*", default=list(COMMON))
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/decode.json"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

@@ -128,7 +128,7 @@ def _card(folder: Path, seed: int, counts: dict[str, dict]) -> dict:
     log = folder / "log.jsonl"
     runs = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     return {
-        "what": "Garments cut from parametric two-panel patterns, draped on the neutral body by our simulator",
+        "what": "Garments cut from parametric patterns, draped on the neutral body by our simulator",
         "licence": "CC0-1.0",
         "seed": seed,
         "garments": kept,

@@ -136,11 +136,11 @@ def _perception() -> Iterator[Finding]:
 
 
 def _weights() -> Iterator[Finding]:
-    """Every garment kind's decoder, against the digest that the manifest holds."""
+    """The decoder of every kind that a photo may name, against the digest that the manifest holds."""
     from recon.files.weights import PACKAGED, read_manifest, read_weights
-    from recon.garments import KINDS
+    from recon.garments import COMMON
 
-    names = {f"isp-{kind}": f"recon train isp --kind {kind}" for kind in KINDS}
+    names = {f"isp-{kind}": f"recon train isp --kind {kind}" for kind in COMMON}
     try:
         cards = read_manifest()
     except UserError as error:

@@ -19,7 +19,7 @@ from recon.files.atomic import write_whole
 from recon.files.meshes import write_obj
 from recon.files.user_garments import read_garment_mesh
 from recon.files.weights import read_manifest, read_weights
-from recon.garments import KINDS
+from recon.garments import COMMON
 from recon.garments.udf import FAMILIES, UdfDecoder, family_of, load_udf
 from recon.metrics import sample_surface, surface_distance
 from recon.types import Mesh, UserError
@@ -87,8 +87,8 @@ def encode(config: Encode) -> dict[str, Any]:
     """
     if len(config.mesh) != 1:
         raise UserError(f"recon encode: found {len(config.mesh)} files, wanted one mesh")
-    if config.kind != "auto" and config.kind not in KINDS:
-        raise UserError(f"garment kind: found {config.kind!r}, wanted auto or one of {', '.join(KINDS)}")
+    if config.kind != "auto" and config.kind not in COMMON:
+        raise UserError(f"garment kind: found {config.kind!r}, wanted auto or one of {', '.join(COMMON)}")
     path = config.mesh[0]
     mesh, notes = read_garment_mesh(path, config.unit)
     target = None if config.out is None else config.out / "code.json"
@@ -111,7 +111,7 @@ def encode(config: Encode) -> dict[str, Any]:
 
 def _best(config: Encode, mesh: Mesh) -> Guess:
     """The guess whose decoded field is closest to the mesh."""
-    kinds = list(KINDS) if config.kind == "auto" else [config.kind]
+    kinds = list(COMMON) if config.kind == "auto" else [config.kind]
     ups = ("y", "z") if config.up == "auto" else (config.up,)
     families = {family_of(k): k for k in kinds}
     there = {name: kind for name, kind in families.items() if f"udf-{name}" in read_manifest(config.weights)}

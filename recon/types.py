@@ -120,7 +120,7 @@ class Garment:
     """
 
     kind: str
-    """Key of ``recon.garments.KINDS``: top, skirt, trousers or dress."""
+    """Key of ``recon.garments.KINDS``: top, skirt, trousers, dress ..."""
     mesh: Mesh
     """(V, 3) welded vertices, rest pose on the neutral body [m]; differentiable in the latent when decoded."""
     panel_points: Tensor

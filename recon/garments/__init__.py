@@ -33,6 +33,9 @@ NAMES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Garment name that a user may give -> its kind and the variants that the name allows."""
 
+COMMON = tuple(dict.fromkeys(kind for kind, _ in NAMES.values()))
+"""Kinds that a photo may name, whose weights ship; the others are there to be trained."""
+
 WAISTED = ("trousers", "skirt")
 """Kinds that a waistband holds up."""
 
