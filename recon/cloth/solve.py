@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 import warp as wp
 from numpy.typing import NDArray
+from scipy.linalg.blas import dtrsv
 from scipy.sparse.linalg import splu
 
 from recon.cloth.constraints import Constraints, close_strangers, held_height
@@ -241,7 +242,8 @@ def springs(cloth: Cloth, laplacian: sp.csr_matrix, diagonal: NDArray) -> Callab
     """Multiplies (V, 3) by the inverse of a stand-in for the Hessian: springs along edges, ``diagonal`` (V,) [N/m]."""
     fabric = cloth.fabric
     spring = fabric.thickness * (2 * fabric.lame_mu + fabric.lame_lambda)
-    return splu((spring * laplacian + sp.diags(diagonal + 0.02 * spring)).tocsc()).solve
+    matrix = (spring * laplacian + sp.diags(diagonal + 0.02 * spring)).tocsc()
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve
 
 
 def lbfgs(
@@ -265,19 +267,19 @@ def lbfgs(
         tolerance: stop when no entry of the gradient is larger than this.
     """
     value, gradient = function(x)
-    steps: list[tuple[NDArray, NDArray, float]] = []
+    pairs = _Pairs(memory, x.size)
     for _ in range(iterations):
         if np.abs(gradient).max(initial=0.0) <= tolerance:
             break
-        direction = -_two_loops(gradient, steps, precondition)
-        slope = float((direction * gradient).sum())
+        direction = -pairs.times(gradient, precondition)
+        slope = float(np.vdot(direction, gradient))
         if slope >= 0:
-            steps = []
-            direction = -gradient if precondition is None else -precondition(gradient)
-            slope = float((direction * gradient).sum())
+            pairs = _Pairs(memory, x.size)
+            direction = -pairs.times(gradient, precondition)
+            slope = float(np.vdot(direction, gradient))
         reach = max(float(np.abs(direction).max()), 1e-30)
         # The first plain step has no scale yet: a tenth of a millimetre at most.
-        bound = longest if precondition is not None else (np.inf if steps else 1e-4)
+        bound = longest if precondition is not None else (np.inf if pairs.rows else 1e-4)
         length = min(1.0, bound / reach)
         for _ in range(12):
             new = x + length * direction
@@ -287,28 +289,46 @@ def lbfgs(
             length *= 0.4
         else:
             return x
-        s, y = new - x, new_gradient - gradient
-        curvature = float((s * y).sum())
-        if curvature > 1e-12 * float((y * y).sum()):
-            steps = [*steps[-memory + 1 :], (s, y, 1 / curvature)]
+        pairs.add((new - x).ravel(), (new_gradient - gradient).ravel())
         x, value, gradient = new, new_value, new_gradient
     return x
 
 
-def _two_loops(
-    gradient: NDArray,
-    steps: list[tuple[NDArray, NDArray, float]],
-    precondition: Callable[[NDArray], NDArray] | None = None,
-) -> NDArray:
-    q, alphas = gradient.copy(), []
-    for s, y, rho in reversed(steps):
-        alphas.append(rho * float((s * q).sum()))
-        q -= alphas[-1] * y
-    if precondition is not None:
-        q = precondition(q)
-    elif steps:
-        s, y, rho = steps[-1]
-        q *= 1 / (rho * float((y * y).sum()))
-    for (s, y, rho), alpha in zip(steps, reversed(alphas)):
-        q += (alpha - rho * float((y * q).sum())) * s
-    return q
+class _Pairs:
+    """Steps s and the gradient's changes y over them: L-BFGS' two loops as products with whole matrices.
+
+    With R the upper triangle of s_i . y_j, oldest first, the first loop solves R alpha = S g, the second
+    R^T c = D alpha - Y r: the same numbers, at a fraction of the time that pair after pair takes.
+    """
+
+    def __init__(self, memory: int, size: int):
+        self.s, self.y, self.products = np.zeros((memory, size)), np.zeros((memory, size)), np.zeros((memory, memory))
+        self.rows: list[int] = []
+        """Rows in use, oldest first."""
+
+    def add(self, s: NDArray, y: NDArray) -> None:
+        """Keep a pair, in the place of the oldest if need be; dropped where the function does not curve upward."""
+        if np.dot(s, y) <= 1e-12 * np.dot(y, y):
+            return
+        row = len(self.rows) if len(self.rows) < len(self.s) else self.rows.pop(0)
+        self.s[row], self.y[row] = s, y
+        self.products[row], self.products[:, row] = self.y @ s, self.s @ y
+        self.rows.append(row)
+
+    def times(self, gradient: NDArray, precondition: Callable[[NDArray], NDArray] | None) -> NDArray:
+        """The inverse Hessian's stand-in times a gradient of any shape."""
+        used, rows = slice(len(self.rows)), self.rows
+        if not rows:
+            return gradient if precondition is None else precondition(gradient)
+        upper = self.products[np.ix_(rows, rows)]
+        alpha, c = np.zeros(len(self.s)), np.zeros(len(self.s))
+        alpha[rows] = dtrsv(upper, (self.s[used] @ gradient.ravel())[rows])
+        q = (gradient.ravel() - alpha[used] @ self.y[used]).reshape(gradient.shape)
+        if precondition is not None:
+            q = precondition(q)
+        else:
+            newest = rows[-1]
+            q *= self.products[newest, newest] / np.dot(self.y[newest], self.y[newest])
+        right = np.diag(upper) * alpha[rows] - (self.y[used] @ q.ravel())[rows]
+        c[rows] = dtrsv(upper, right, trans=1)
+        return q + (c[used] @ self.s[used]).reshape(gradient.shape)
