@@ -74,8 +74,8 @@ class BodyFit:
     """Weight of the person's mask left uncovered (small: clothes stand off the body)."""
     posing: Descent = field(default_factory=lambda: Descent(steps=220, patience=40))
     """First descent: landmarks alone."""
-    shaping: Descent = field(default_factory=lambda: Descent(steps=70, patience=25))
-    """Second descent: with silhouettes."""
+    shaping: Descent = field(default_factory=lambda: Descent(steps=70, patience=70, rate=0.4))
+    """Second descent: with silhouettes, in small steps, from where large ones have settled."""
     long_side: int = 160
     """Resolution of the silhouettes."""
 
