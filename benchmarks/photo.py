@@ -135,7 +135,7 @@ def write_page(found: dict) -> None:
             "",
             "## Outfits of known truth",
             "",
-            "Unseen test garments simulated on unseen bodies and poses, fitted from their masks and from landmarks with",
+            "Unseen test garments, simulated on unseen bodies and poses, fitted from their masks and landmarks with",
             "1 % noise in the photo and in space; surface distances both ways, the pelvis moved onto the true one.",
             "",
             "| kind | cases | IoU, median | Chamfer to truth, median mm |",
