@@ -179,14 +179,11 @@ class IspDecoder:
     def _project(self, field: list[Layer], x: Tensor, panel: Tensor, longest: float, rounds: int, exact: bool = True):
         """Points moved along the gradient onto the zero level (B.2), in all at most ``longest``; with their logits.
 
-        The way there may be rough, its length must be ``exact`` for the points to lie on the border.
+        ``exact``: points that are projected again may stop a little short of it.
         """
-        start, halves = x, halves_are_fast(x.device)
-        row = torch.arange(len(x), device=x.device)
+        start, halves = x, not exact and halves_are_fast(x.device)
         for _ in range(rounds):
             own, slope, logits = self._slope(field, x, panel, halves)
-            if exact and halves:
-                own = self.nets.pattern.run_folded(field, x.detach())[row, panel]
             step = own[:, None] * slope / slope.square().sum(1, keepdim=True).clamp_min(0.1)
             away = x - step - start
             x = start + away * (longest / away.norm(dim=1, keepdim=True).clamp_min(longest))
