@@ -20,6 +20,7 @@ from picture import ROOT, draw_panels
 from pipelines.edit import Edit, edit
 from pipelines.fit_code import CodeFit
 from pipelines.fit_evidence import Bank
+from pipelines.palette import layer_colour
 from recon.bodies import load_body
 from recon.files.codes import read_code
 from recon.garments.dataset import load_garments
@@ -40,9 +41,15 @@ def neutral() -> Mesh:
 
 
 def panels_of(garment: Garment, size: tuple[int, int]) -> NDArray:
-    """(h, w, 3) BGR drawing of both panels."""
+    """(h, w, 3) BGR drawing of all panels."""
     flat = garment.panel_points.detach().numpy()[garment.panel_faces.numpy()]
-    return draw_panels(flat, garment.panel_of_face.numpy(), COLOUR, size)
+    return draw_panels(flat, garment.side_of_face.numpy(), panel_colours(garment), size, garment.panel_of_face.numpy())
+
+
+def panel_colours(garment: Garment) -> list[tuple[float, float, float]]:
+    """One colour for garments of two panels, one each where there are more."""
+    count = len(garment.panel_names)
+    return [COLOUR] * 2 if count == 2 else [layer_colour(k) for k in range(count)]
 
 
 def column(
@@ -51,7 +58,10 @@ def column(
     """(h, w, 3) BGR: caption, panels, picture."""
     h, w = size
     shown = [body, garment.mesh.with_vertices(garment.mesh.vertices.detach())]
-    image = picture(shown, [SKIN, COLOUR], orbit_camera(shown, azimuth, 0.0, (h, w)), look=FAST).numpy()[..., ::-1]
+    colours: list = [SKIN, COLOUR]
+    if len(garment.panel_names) > 2:
+        shown[1], colours[1] = unsewn(garment), torch.tensor(panel_colours(garment))[garment.panel_of_point]
+    image = picture(shown, colours, orbit_camera(shown, azimuth, 0.0, (h, w)), look=FAST).numpy()[..., ::-1]
     head = np.full((26, w, 3), 255, np.uint8)
     cv2.putText(head, caption, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.48, (40, 40, 40), 1, cv2.LINE_AA)
     return np.vstack([head, panels_of(garment, (h // 2, w)), image])
@@ -143,11 +153,22 @@ def textured(decoder: IspDecoder, variants: Sequence[str], size: tuple[int, int]
     return np.vstack([np.hstack([head, pad]), whole])
 
 
+def six(folder: Path, truths: Sequence[Garment]) -> NDArray:
+    """Shirts of six panels: true and decoded from their learned codes, before and behind."""
+    decoder = load_isp("shirt6", folder)
+    with torch.no_grad():
+        found = [decoder.decode(code, 160) for code in decoder.codes[: len(truths)]]
+    shown = [g for pair in zip(truths, found, strict=True) for g in pair]
+    captions = ["simulated", "decoded"] * len(truths)
+    return np.vstack([sheet(shown, captions, (260, 260), azimuth) for azimuth in (0.3, 3.4)])
+
+
 def main() -> None:
     """Write the pictures of docs/results/isp.md."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results")
     parser.add_argument("--only", nargs="*", default=["texture", "between", "edit", "fits"])
+    parser.add_argument("--six", type=Path, help="folder of shirt6's data and weights, for --only six")
     options = parser.parse_args()
     torch.set_num_threads(1)
     tops = load_isp("top")
@@ -155,6 +176,7 @@ def main() -> None:
         "texture": lambda: textured(tops, ("shirt", "jacket", "tank", "tshirt")),
         "between": lambda: between(tops, (("shirt", "jacket"), ("tank", "shirt"))),
         "edit": lambda: edited(ROOT / "out" / "benchmarks"),
+        "six": lambda: six(options.six, load_garments(options.six / "shirt6_train.npz")[:2]),
         "fits": lambda: fits((("top", 0), ("trousers", 1))),
     }
     for name in options.only:

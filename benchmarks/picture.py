@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -35,16 +36,24 @@ def read(path: Path) -> tuple[Mesh, NDArray, NDArray]:
     return mesh, flat, (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0).astype(int)
 
 
-def draw_panels(flat: NDArray, panel: NDArray, colour, size: tuple[int, int]) -> NDArray:
-    """Both panels beside each other, filled, outlined; (h, w, 3) BGR."""
+def draw_panels(flat: NDArray, side: NDArray, colours: Sequence, size: tuple[int, int], panel: NDArray) -> NDArray:
+    """Front and back beside each other, filled, outlined; (h, w, 3) BGR.
+
+    Args:
+        flat: (F, 3, 2) triangles in the plane.
+        side: (F,) 0 = front, 1 = back.
+        colours: of each panel.
+        size: (h, w).
+        panel: (F,) index into ``colours``.
+    """
     h, w = size
     image = np.full((h, w, 3), 255, np.uint8)
     low, high = flat.min((0, 1)), flat.max((0, 1))
     scale = 0.9 * min(w / 2 / (high - low)[0], h / (high - low)[1])
-    tint = np.array(colour[::-1]) * 255
-    for k in (0, 1):
+    for k, number in sorted(set(zip(side.tolist(), panel.tolist(), strict=True))):
+        tint = np.array(colours[number][::-1]) * 255
         centre = np.array([(k + 0.5) * w / 2, h / 2])
-        pixels = (flat[panel == k] - (low + high) / 2) * [scale, -scale] + centre
+        pixels = (flat[(side == k) & (panel == number)] - (low + high) / 2) * [scale, -scale] + centre
         mask = np.zeros((h, w), np.uint8)
         for triangle in np.round(pixels * 16).astype(np.int32):
             cv2.fillConvexPoly(mask, triangle, 255, shift=4)
@@ -80,7 +89,9 @@ def main() -> None:
         camera = orbit_camera(meshes, azimuth, 0.0, (HEIGHT, 360))
         parts.append(picture(meshes, colours, camera).numpy()[..., ::-1])
     share = HEIGHT // len(names)
-    sheets = [draw_panels(flat, panel, colour_of(n), (share, 480)) for n, (_, flat, panel) in zip(names, worn)]
+    sheets = [
+        draw_panels(flat, side, [colour_of(n)] * 2, (share, 480), side) for n, (_, flat, side) in zip(names, worn)
+    ]
     parts.append(cv2.resize(np.vstack(sheets), (480, HEIGHT)))
     cv2.imwrite(str(options.out), np.hstack(parts))
 
