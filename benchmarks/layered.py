@@ -170,8 +170,9 @@ def page(found: dict) -> str:
         "",
         __doc__.split("\n\n")[2],
         AIMS,
+        *(["", found["note"]] if found.get("note") else []),
         "",
-        f"{len(rows)} outfits; the right order in {right}.",
+        f"Outfits: {len(rows)}; the right order in {right}.",
         "",
         "| layer | garments | IoU, median | IoU, worst | whole mm, median | covered mm, median |",
         "|---|---|---|---|---|---|",
@@ -196,10 +197,12 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "benchmark")
     parser.add_argument("--shown", type=int, default=6, help="outfits in the picture")
+    parser.add_argument("--note", help="what a reader must know about this run")
     options = parser.parse_args()
     store = ROOT / "docs" / "results" / "layered.json"
     found = json.loads(store.read_text()) if store.exists() else {"rows": {}}
     found |= {"machine": platform.processor() or platform.machine(), "cores": os.cpu_count()}
+    found |= {"note": options.note} if options.note is not None else {}
     for number in range(options.cases):
         if str(number) not in found["rows"]:
             found["rows"][str(number)] = run(number, options.out)

@@ -12,8 +12,9 @@ from recon.garments.panels import Panel, cross
 
 SHORTEST_RUN = 0.025
 """Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
-SLIT_SHARE = 0.8
-"""An open run within one seam and shorter than this share of each of its two parts is a wrong label."""
+SLIT_SHARES = (1.5, 0.8)
+"""An open run within one seam and shorter than these shares of the shorter and the longer of its two parts is a wrong
+label: between shorts and trousers, the hem of the shorts leaves such traces in the inseam."""
 CORNER_REACH = 0.03
 """How far from a label change its corner is searched [domain units]."""
 MAX_CHAIN_DISTANCE = 0.15
@@ -56,8 +57,8 @@ def without_slits(labels: NDArray, lengths: NDArray) -> NDArray:
         starts = np.nonzero(labels != np.roll(labels, 1))[0]
         runs = labels[starts]
         run = (total[np.roll(starts, -1)] - total[starts]) % total[-1]
-        beside = np.minimum(np.roll(run, 1), np.roll(run, -1))
-        short = (run < SLIT_SHARE * beside) & (beside > 4 * SHORTEST_RUN)
+        less, more = np.sort([np.roll(run, 1), np.roll(run, -1)], axis=0)
+        short = (run < SLIT_SHARES[0] * less) & (run < SLIT_SHARES[1] * more) & (less > 2 * SHORTEST_RUN)
         slits = np.nonzero((runs == 0) & (np.roll(runs, 1) == np.roll(runs, -1)) & short)[0]
         if len(starts) < 3 or not len(slits):
             return labels

@@ -201,6 +201,10 @@ def test_a_slit_within_a_seam_is_sewn_and_openings_between_seams_stay() -> None:
         assert without_slits(np.roll(labels, shift), even).tolist() == np.roll(whole, shift).tolist()
     tube = np.array([1, 1, 1, 0, 0, 0])
     assert without_slits(tube, np.ones(6)).tolist() == tube.tolist()
+    near_its_end = np.array([1] * 10 + [0] * 6 + [1] * 5 + [0] * 4 + [2] * 9 + [0] * 4)
+    assert without_slits(near_its_end, np.ones(38)).tolist() == [1] * 21 + near_its_end.tolist()[21:]
+    stray = np.array([1] * 20 + [0] * 10 + [1] * 2 + [2] * 9 + [0] * 4)  # a trace of the seam beyond an open hem
+    assert without_slits(stray, np.ones(45)).tolist() == stray.tolist()
     both_ways = np.array([1] * 4 + [0] * 4 + [1] * 4 + [0] * 4)  # a tube with one seam label on both sides
     assert without_slits(both_ways, np.ones(16)).tolist() == both_ways.tolist()
 
