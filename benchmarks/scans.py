@@ -1,11 +1,15 @@
 """recon scan on scans of known truth: outfits that no decoder saw on random bodies, with noise and holes.
 
     python benchmarks/scans.py --cases 20              # to docs/results/scan.json and scan.md: minutes a case
+    python benchmarks/scans.py --decoder udf --draper drapenet --weights out/weights --out out/scans-udf
     python benchmarks/scans.py --cases 8 --body        # the body stage alone; prints one JSON object a case
 
 Poses take turns: A, T, standing, and random within the joints' limits; the person faces anywhere. Distances in mm:
 ``code`` and ``refined`` are the truth's vertices to the fitted surface (medians; the code's as skinned, before
 refinement), ``body`` the true body's skin to the fitted one's, ``body_vertex`` between the same vertices.
+
+Interrupted, the same command goes on: finished cases are kept under out/benchmarks/scans, and so are the finished
+stages of the one under way. Other settings, weights or versions have another folder there.
 """
 
 from __future__ import annotations
@@ -13,14 +17,15 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
 import torch
 from made_scans import OUTFITS, POSES, MadeScan, make_scan
 
+import recon
 from pipelines.fit_body import to_body
 from pipelines.fit_scan_body import ScanBodyFit, fit_scan_body
 from pipelines.measure import by_code, geometry
@@ -28,6 +33,9 @@ from pipelines.models import load_models
 from pipelines.run import Run
 from pipelines.scan import ScanFit, fit_labelled
 from recon.cloth.contact import BodyContact
+from recon.files.atomic import write_whole
+from recon.files.state import canonical, digest
+from recon.files.weights import read_manifest
 from recon.metrics import surface_distance
 from recon.types import Mesh
 
@@ -49,20 +57,33 @@ def body_figures(made: MadeScan, values: dict, body) -> dict:
     return {"body": float(skin.median()), "body_vertex": float(away.median()), "regions": parts}
 
 
-def run_case(number: int, config: ScanFit, body_only: bool) -> dict:
-    """Make and fit one scan."""
+def kept_case(number: int, config: ScanFit, kept: Path) -> dict:
+    """A case's figures: read where it is finished, else made."""
+    row = kept / f"case-{number:02d}.json"
+    if not row.is_file():
+        write_whole(row, json.dumps(run_case(number, config, False, kept), indent=1) + "\n")
+    return json.loads(row.read_text())
+
+
+def folder_of(config: ScanFit) -> Path:
+    """Where the cases of these settings are kept."""
+    key = digest(canonical(replace(config, out=Path())), canonical(read_manifest(config.weights)), recon.__version__)
+    return ROOT / "out" / "benchmarks" / "scans" / key[:12]
+
+
+def run_case(number: int, config: ScanFit, body_only: bool, kept: Path) -> dict:
+    """Make and fit one scan; stages are kept in ``kept``, and their seconds count whenever they were spent."""
     outfit, pose = OUTFITS[number % len(OUTFITS)], POSES[number % len(POSES)]
     models = load_models(outfit, config)
-    made = make_scan(outfit, number, pose, models.body, models.draper)
+    made = make_scan(outfit, number, pose, models.body, models.skinning)
     row: dict = {"case": number, "outfit": "+".join(outfit), "pose": pose}
-    begin = time.perf_counter()
     if body_only:
+        begin = time.perf_counter()
         values = fit_scan_body(made.scan, models.body, ScanBodyFit())
         return row | {"seconds": time.perf_counter() - begin, **body_figures(made, values, models.body)}
-    with tempfile.TemporaryDirectory() as folder:
-        run = Run(Path(folder) / "case", {"case": number})
-        values, layers, meshes = fit_labelled(made.scan, models, config, run)
-    row |= {"seconds": time.perf_counter() - begin, **body_figures(made, values, models.body), "garments": {}}
+    run = Run(kept / f"case-{number:02d}", {"case": number})
+    values, layers, meshes = fit_labelled(made.scan, models, config, run)
+    row |= {"seconds": sum(run.seconds.values()), **body_figures(made, values, models.body), "garments": {}}
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
         contact = BodyContact(posed.mesh.vertices[0], models.body.faces)
@@ -104,15 +125,20 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--body", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--decoder", default="isp")
+    parser.add_argument("--draper", default="skinning")
+    parser.add_argument("--weights", type=Path, help="folder of weights; default: those that ship")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    config, rows, out = ScanFit(scan=Path("made")), [], ROOT / "docs" / "results"
+    config = ScanFit(scan=Path("made"), decoder=args.decoder, draper=args.draper, weights=args.weights)
+    kept, rows = folder_of(config), []
     for number in range(args.first, args.first + args.cases):
-        rows.append(run_case(number, config, args.body))
+        rows.append(run_case(number, config, True, kept) if args.body else kept_case(number, config, kept))
         print(json.dumps(rows[-1]), flush=True)
         if not args.body:
-            (out / "scan.json").write_text(json.dumps(rows, indent=1) + "\n")
-            (out / "scan.md").write_text(page(rows))
+            write_whole(args.out / "scan.json", json.dumps(rows, indent=1) + "\n")
+            write_whole(args.out / "scan.md", page(rows))
 
 
 if __name__ == "__main__":

@@ -118,8 +118,8 @@ def encode_ms(decoder: UdfDecoder, rounds: int) -> float:
     return round(1e3 * seconds(lambda: decoder.encode(points), rounds), 1)
 
 
-def measure(quick: bool) -> dict[str, object]:
-    """All figures; those of the networks where weights are there.
+def measure(quick: bool, folder: Path | None = None) -> dict[str, object]:
+    """All figures; those of the networks where weights are there (in ``folder``, or those that ship).
 
     ``udf_decode_s`` and ``hole_free_share`` have one entry per resolution, ``fd_error_pct`` inside and on borders.
     """
@@ -127,8 +127,8 @@ def measure(quick: bool) -> dict[str, object]:
     result: dict[str, object] = {
         "hole_free_share": {str(r): exact_holes(r, 2 if quick else 10)["share"] for r in exact},
     }
-    known = [name for name in FAMILIES if f"udf-{name}" in read_manifest()]
-    decoders = {name: load_udf(FAMILIES[name][0]) for name in known}
+    known = [name for name in FAMILIES if f"udf-{name}" in read_manifest(folder)]
+    decoders = {name: load_udf(FAMILIES[name][0], folder) for name in known}
     if not decoders:
         return result | {"networks": "none trained"}
     first = decoders[known[0]]
@@ -157,6 +157,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--weights", type=Path, help="folder of weights; default: those that ship")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks/udf.json"))
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
@@ -166,7 +167,7 @@ def main() -> None:
         "torch": torch.__version__,
         "seed": 0,
     }
-    result = machine | measure(options.quick)
+    result = machine | measure(options.quick, options.weights)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result))

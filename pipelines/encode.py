@@ -119,7 +119,7 @@ def _best(config: Encode, mesh: Mesh) -> Guess:
     guesses = []
     for decoder in decoders:
         if config.kind == "auto":
-            decoder = UdfDecoder(decoder.nets, decoder.all_codes, decoder.known)
+            decoder = UdfDecoder(decoder.nets, decoder.all_codes, decoder.known, sided=decoder.sided)
         for up in ups:
             for turned in (False, True):
                 guesses += _places(config, decoder, _turn(mesh, up, turned), up, turned)

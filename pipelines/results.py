@@ -66,6 +66,11 @@ def panel_notes(layers: Sequence[Layer]) -> list[str]:
     return [f"{', '.join(bare)}: {why}"]
 
 
+def shifted(layers: Sequence[Layer], shift: Tensor) -> list[Layer]:
+    """The layers with what lies in the world moved by ``shift`` (3,) [m]."""
+    return [layer if layer.coded is None else replace(layer, coded=layer.coded + shift) for layer in layers]
+
+
 def grounded(body: Mesh, meshes: dict[str, Mesh]) -> tuple[Mesh, dict[str, Mesh], Tensor]:
     """Move the world so that the body's lowest point is at y = 0 below x = z = 0.
 
@@ -135,7 +140,7 @@ def write_results(
         "notes": [*photo.notes, *panel_notes(layers)],
     }
     write_meshes(out, body, layers, moved)
-    result = FitResult(out, figures, place, body, tuple(layers), moved, photo=photo, camera=camera)
+    result = FitResult(out, figures, place, body, tuple(shifted(layers, shift)), moved, photo=photo, camera=camera)
     pictures = write_pictures(result)
     took = time.perf_counter() - begin
     figures["seconds"] = {**seconds, "export": took, "total": sum(seconds.values()) + took}

@@ -14,7 +14,7 @@ from pipelines.fit_body import to_body
 from pipelines.fit_garment import Layer, Models
 from pipelines.fit_result import FitResult
 from pipelines.measure import by_code, geometry
-from pipelines.results import described, grounded, header, panel_notes, write_meshes
+from pipelines.results import described, grounded, header, panel_notes, shifted, write_meshes
 from pipelines.scan_report import HIDDEN, coloured, write_scan_pictures, write_scan_report
 from recon.cloth.contact import BodyContact
 from recon.files.atomic import write_whole
@@ -34,7 +34,7 @@ def write_scan_results(config, scan: Scan, models: Models, fitted: Fitted, secon
     with torch.no_grad():
         posed = models.body.pose(to_body(values))
     body, moved, shift = grounded(Mesh(posed.mesh.vertices[0], models.body.faces), meshes)
-    scan = replace(scan, points=scan.points + shift)
+    scan, layers = replace(scan, points=scan.points + shift), shifted(layers, shift)
     place = replace(to_body(values), translation=values["translation"] + shift)
     gaps = {name: to_scan(mesh, name, scan) for name, mesh in moved.items()}
     figures = {

@@ -1,9 +1,10 @@
 """Train the garment generative network (DrapeNet §3.1, Eq. 1-5): ``recon train udf --family upper``.
 
 Encoder and decoder learn together: points of a garment give its code, the code gives the field, and the field is held
-against exact distances and gradients. The encoder is slow on a CPU and its codes say little at first, so in the compact
-training only some garments of a batch go through it; the others have their aim for a code, principal components of
-distances, which the encoder learns to meet. With ``encoded`` = ``batch`` and ``aim`` = 0 it is the paper's training.
+against exact distances and gradients. The encoder is slow on a CPU, and a decoder that sees its codes blurs whatever it
+does not tell apart. So in the compact training codes are free: they begin as principal components of distances and
+learn with the decoder, and the encoder learns to meet them. ``codes`` = ``encoded`` is the paper's training, as far as
+``encoded`` reaches: garments of a batch beyond that have their principal components for a code.
 """
 
 from __future__ import annotations
@@ -11,19 +12,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from pipelines.training import Budget, Training, settings_of
-from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect
-from recon.files.weights import write_weights
+from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect, sides_of
+from recon.files.weights import read_weights, write_weights
 from recon.garments.dataset import Item, load_items
-from recon.garments.udf import FAMILIES, Known, UdfDecoder
+from recon.garments.udf import FAMILIES, Known, Sided, UdfDecoder
 from recon.garments.udf_net import UdfNets, UdfShape
 from recon.types import UserError
+
+NOISE = 0.05
+"""Deviation of what is added to codes in training: codes beside one another describe garments alike."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,16 @@ class TrainUdf:
     """Places per garment and step (the paper: 20000)."""
     slopes: int = 400
     """How many of them also have their gradient compared (the paper: all)."""
-    encoded: int = 4
+    codes: Literal["free", "encoded"] = "free"
+    """What the decoder learns from: codes that learn with it, or those of the encoder, as in the paper."""
+    encoded: int = 2
     """How many garments of a batch go through the encoder."""
     aim: float = 0.3
-    """Weight of the distance between their codes and the aims."""
+    """Weight of the distance between their codes and those that they should have."""
+    tie: float = 0.01
+    """Weight that keeps free codes near where they begin."""
+    begin: Path | None = None
+    """Folder of weights whose networks to begin from, where they have the same sizes."""
     loss: Literal["bce", "l1", "l2"] = "bce"
     """Distance loss: binary cross-entropy (Eq. 4), or the alternatives of §7.1."""
     gradient: float = 0.1
@@ -114,55 +124,89 @@ def learn(items: Sequence[Item], config: TrainUdf) -> tuple[UdfDecoder, Training
     if config.size == "compact":
         shape = replace(shape, head=config.head, width=config.width)
     samples = collect(meshes, shape, config.sampling, torch.Generator().manual_seed(config.seed))
-    training = start(shape, config, len(samples))
+    training = start(shape, config, samples.aims)
     training.resume()
-    nets = training.module
-    assert isinstance(nets, UdfNets)
+    learner = training.module
+    assert isinstance(learner, Learner)
     generator = torch.Generator().manual_seed(config.seed + training.step)
-    nets.train()
-    training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(nets, samples, config, generator))
-    nets.eval()
+    learner.train()
+    training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(learner, samples, config, generator))
+    learner.eval()
     known = [Known(i.garment.kind, i.garment.variant, dict(i.parameters)) for i in items]
-    return UdfDecoder(nets, codes_of(nets, samples), known), training
+    codes = learner.codes.detach() if config.codes == "free" else codes_of(learner.nets, samples)
+    decoder = UdfDecoder(learner.nets, codes, known)
+    return UdfDecoder(learner.nets, codes, known, sided=sides_of(decoder, meshes)), training
 
 
-def start(shape: UdfShape, config: TrainUdf, count: int) -> Training:
-    """A training that has not begun; ``count``: how many garments it will see."""
+class Learner(nn.Module):
+    """The networks and the free codes of the garments that they learn from."""
+
+    def __init__(self, nets: UdfNets, codes: Tensor):
+        """``codes`` (G, Z): where they begin."""
+        super().__init__()
+        self.nets, self.codes = nets, nn.Parameter(codes.clone())
+
+
+def start(shape: UdfShape, config: TrainUdf, aims: Tensor) -> Training:
+    """A training that has not begun; ``aims`` (G, Z): where codes begin.
+
+    UserError: ``begin`` has networks of other sizes.
+    """
     torch.manual_seed(config.seed)
-    nets = UdfNets(shape)
-    adam = torch.optim.Adam(nets.parameters(), lr=config.rate, betas=(0.9, 0.99))
-    return Training(
-        f"udf-{config.family}", nets, adam, settings_of(config, ("evaluate", "garments"), count=count), config.out
-    )
+    learner = Learner(UdfNets(shape), aims)
+    if config.begin is not None:
+        known = read_weights(f"udf-{config.family}", config.begin).tensors
+        try:
+            learner.nets.load_state_dict({k: v for k, v in known.items() if k != "codes"})
+        except RuntimeError as error:
+            raise UserError(f"{config.begin}: networks of other sizes; wanted those of these settings") from error
+    adam = torch.optim.Adam(learner.parameters(), lr=config.rate, betas=(0.9, 0.99))
+    settings = settings_of(config, ("evaluate", "garments"), count=len(aims))
+    return Training(f"udf-{config.family}", learner, adam, settings, config.out)
 
 
 def batch_loss(
-    nets: UdfNets, samples: UdfSamples, config: TrainUdf, generator: torch.Generator
+    learner: Learner, samples: UdfSamples, config: TrainUdf, generator: torch.Generator
 ) -> tuple[Tensor, dict[str, float]]:
     """Eq. 1 on a random batch, and its terms."""
+    nets = learner.nets
     garments = torch.randperm(len(samples), generator=generator)[: config.batch]
-    cloud = torch.randint(samples.clouds.shape[1], (len(garments),), generator=generator)
     pick = torch.randint(samples.places.shape[1], (len(garments), config.places), generator=generator)
     row = garments[:, None]
     x, wanted = samples.places[row, pick], samples.distance[row, pick]
     slopes = config.slopes if config.gradient else 0
     direction = samples.direction[row, pick[:, :slopes]].float()
     with torch.autocast(x.device.type, torch.bfloat16, enabled=config.size == "compact"):
-        some, aims = garments[: config.encoded], samples.aims[garments]
-        own = nets.encoder(
-            samples.clouds[some, cloud[: len(some)]], samples.near[some, cloud[: len(some)]].int()
-        ).float()
-        z = torch.cat([own, aims[len(some) :] + 0.05 * torch.randn(aims[len(some) :].shape, generator=generator)])
+        z, own, aims = batch_codes(learner, samples, config, garments, generator)
         found, gradient = fields(nets, x, z, slopes)
     distance = distance_loss(found, wanted, config.loss)
     terms = {"distance": distance.detach(), "mm": 1e3 * nets.shape.reach * _near_error(found, wanted)}
-    code = (own - aims[: len(own)]).square().mean()
+    code = (own - aims).square().mean() if len(own) else own.new_zeros(())
     loss, terms["code"] = distance + config.aim * code, code.detach()
+    if config.codes == "free":
+        loss = loss + config.tie * (learner.codes[garments] - samples.aims[garments]).square().mean()
     if slopes:
         known = (direction.square().sum(-1) > 0.5).float()
         off = ((gradient - direction).square().sum(-1) * known).sum() / known.sum().clamp_min(1)
         loss, terms["slope"] = loss + config.gradient * off, off.detach()
     return loss, {k: float(v) for k, v in terms.items()}
+
+
+def batch_codes(
+    learner: Learner, samples: UdfSamples, config: TrainUdf, garments: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The codes (B, Z) that the decoder sees of a batch; the encoder's for its first ones, and what they should be."""
+    some = garments[: config.encoded]
+    cloud = torch.randint(samples.clouds.shape[1], (len(garments),), generator=generator)[: len(some)]
+    own = samples.aims[:0]
+    if len(some):
+        own = learner.nets.encoder(samples.clouds[some, cloud], samples.near[some, cloud].int()).float()
+    free = config.codes == "free"
+    given = learner.codes[garments] if free else samples.aims[garments]
+    z = given + NOISE * torch.randn(given.shape, generator=generator)
+    if not free:
+        z = torch.cat([own, z[len(some) :]])
+    return z, own, given[: len(some)].detach()
 
 
 def fields(nets: UdfNets, x: Tensor, z: Tensor, slopes: int) -> tuple[Tensor, Tensor]:
@@ -206,6 +250,11 @@ def codes_of(nets: UdfNets, samples: UdfSamples) -> Tensor:
     return torch.stack(rows)
 
 
+def sides_card(sided: Sided | None) -> dict[str, Any] | None:
+    """What a card says of the surface's sides (``load_udf`` reads it)."""
+    return None if sided is None else {"turn": sided.turn.tolist(), "border": sided.border}
+
+
 def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[str, object]) -> Path:
     """Write ``udf-<family>`` with its card; everything that ``recon.garments`` needs to rebuild the decoder."""
     tensors = {"codes": decoder.all_codes, **decoder.nets.state_dict()}
@@ -216,6 +265,7 @@ def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[s
         "variants": [k.variant for k in decoder.known],
         "parameters": [{k: round(v, 4) for k, v in known.parameters.items()} for known in decoder.known],
         "data": f"{len(decoder.known)} generated garments of kinds {', '.join(FAMILIES[config.family])}",
+        "sides": sides_card(decoder.sided),
         "loss": f"{config.loss}, gradient weight {config.gradient}",
         **done.card(config),
         "licence": "CC0-1.0",

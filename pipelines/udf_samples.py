@@ -15,12 +15,17 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.garments.panels import border_edges
+from recon.garments.udf import Sided, UdfDecoder
 from recon.garments.udf_field import MeshField
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import UdfShape
 from recon.metrics import sample_surface
 from recon.types import Mesh
 
+ONE_WAY = 0.1
+"""Largest square, relative to the other's, that the output beside a surface may change by when it is crossed."""
+ONE_SIDE = 0.8
+"""How much oftener than not the output across a surface must change to the same side."""
 BASIS = 1500
 """Places that all garments' distances are compared at."""
 
@@ -140,3 +145,33 @@ def draw_cloud(mesh: Mesh, shape: UdfShape, generator: torch.Generator) -> tuple
     domain = (points - points.new_tensor(shape.centre)) / shape.half
     near = cKDTree(domain.numpy()).query(domain.numpy(), k=shape.neighbours)[1]
     return domain, torch.as_tensor(near.astype(np.int32))
+
+
+def sides_of(decoder: UdfDecoder, meshes: Sequence[Mesh], beside: float = 0.008) -> Sided | None:
+    """What the decoder's outputs say of sides, on garments of which it has the codes; None if they say nothing sure.
+
+    Args:
+        decoder: its ``all_codes`` are those of the meshes.
+        meshes: what it learned from [m].
+        beside: so far on both sides the outputs are compared [m].
+    """
+    if decoder.nets.shape.head != "pair":
+        return None
+    generator, jumps, rims = torch.Generator().manual_seed(0), [], []
+    with torch.no_grad():
+        for row in range(0, len(meshes), max(1, len(meshes) // 40)):
+            at, normal = sample_surface(meshes[row], 500, generator)
+            layers = decoder.nets.decoder.fold(decoder.all_codes[row])
+            rim = _rim_points(meshes[row], 200, generator)
+            places = torch.cat([at + beside * normal, at - beside * normal, rim])
+            above, below, border = decoder.nets.decoder.outputs(layers, decoder.nets.to_domain(places)).split(
+                [len(at), len(at), len(rim)]
+            )
+            jumps.append(above - below)
+            rims.append(border)
+        jump = torch.cat(jumps)
+        size, axes = torch.linalg.eigh(jump.T @ jump)
+        turn = axes.flip(1)
+        alike = (jump @ turn[:, 0]).sign().mean().abs()
+        border = float((torch.cat(rims) @ turn)[:, 1].abs().median()) * decoder.nets.shape.reach
+    return Sided(turn, border) if size[0] < ONE_WAY * size[1] and alike > ONE_SIDE else None

@@ -60,10 +60,10 @@ def mesh_udf(field: Field, box: Box, meshing: Meshing | None = None) -> Mesh:
         return Mesh(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long))
     points, faces = march(band, signs(field, band, meshing.floor))
     points, faces = cut(field, points, faces, Cutting(band.cell, meshing.beyond))
-    return Mesh(torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(_turned_out(points, faces)))
+    return Mesh(torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(turned_out(points, faces)))
 
 
-def _turned_out(points: NDArray, faces: NDArray) -> NDArray[np.int64]:
+def turned_out(points: NDArray, faces: NDArray) -> NDArray[np.int64]:
     """Faces of each piece turned so that most of its area looks away from its middle."""
     if not len(faces):
         return faces

@@ -52,10 +52,10 @@ def cut(field: Field, points: NDArray, faces: NDArray, cutting: Cutting) -> tupl
         if not len(faces):
             return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
         faces = peel(points, faces, cutting.cell)
-        faces = _without_scraps(points, faces, cutting.scrap * cutting.cell**2)
+        faces = without_scraps(points, faces, cutting.scrap * cutting.cell**2)
         faces = _two_sided(fill_notches(points, faces))
         faces, points = split_pinches(faces, points)
-        points, faces = close_pinholes(field, *_compact(points, faces), cutting)
+        points, faces = close_pinholes(field, *compact(points, faces), cutting)
         points = smooth_borders(field, points, faces, cutting)
     return points, faces
 
@@ -101,7 +101,7 @@ def peel(points: NDArray, faces: NDArray, cell: float) -> NDArray[np.int64]:
     zone, rest = _zone(faces)
     inner = _touched(rest, len(points))
     for _ in range(PEELS):
-        area, size = _areas(points, zone)
+        area, size = areas(points, zone)
         half = np.concatenate([zone[:, [0, 1]], zone[:, [1, 2]], zone[:, [2, 0]]])
         key = half.min(1) * np.int64(len(points)) + half.max(1)
         edge, which, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -190,7 +190,7 @@ def _with(faces: NDArray[np.int64], new: list[list[int]]) -> NDArray[np.int64]:
     return np.concatenate([faces, np.array(kept)])
 
 
-def _areas(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
+def areas(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     """Normals (F, 3) as long as twice the area, and areas (F,)."""
     a, b, c = (points[faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
@@ -215,7 +215,7 @@ def _slope(field: Field, points: NDArray) -> tuple[NDArray, NDArray]:
 
 def vertex_normals(points: NDArray, faces: NDArray) -> NDArray[np.float64]:
     """(V, 3) unit normals, weighted by area; zero where faces have none."""
-    area, _ = _areas(points, faces)
+    area, _ = areas(points, faces)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(area[:, k], 3), len(points)) for k in range(3)], 1)
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
@@ -227,17 +227,17 @@ def _beside(points: NDArray, faces: NDArray, distance: NDArray, gradient: NDArra
     return distance * np.linalg.norm(along, axis=1)
 
 
-def _without_scraps(points: NDArray, faces: NDArray, least: float) -> NDArray:
+def without_scraps(points: NDArray, faces: NDArray, least: float) -> NDArray:
     if not len(faces):
         return faces
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
     graph = coo_matrix((np.ones(len(ends), np.int8), tuple(ends.T)), shape=(len(points), len(points)))
     piece = connected_components(graph, directed=False)[1][faces[:, 0]]
-    area = np.bincount(piece, _areas(points, faces)[1])
+    area = np.bincount(piece, areas(points, faces)[1])
     return faces[area[piece] >= least]
 
 
-def _compact(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
+def compact(points: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     used, faces = np.unique(faces, return_inverse=True)
     return points[used], faces.reshape(-1, 3)
 
@@ -277,7 +277,7 @@ def outward(
         np.add.at(along, ends, points[edges[:, 1]] - points[edges[:, 0]])
     out = np.cross(along, normal[rim])  # faces lie to the left of their edges
     for _ in range(3):
-        out = _averaged(out, index)
+        out = averaged(out, index)
     return rim, out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
 
 
@@ -294,7 +294,7 @@ def smooth_borders(field: Field, points: NDArray, faces: NDArray, cutting: Cutti
     points = points.copy()
     fringe = faces[_touched(rim, len(points))[faces].any(1)]
     for _ in range(cutting.rounds):
-        points[rim] = _averaged(_averaged(points[rim], index), index)
+        points[rim] = averaged(averaged(points[rim], index), index)
         _, way = outward(points, edges, vertex_normals(points, fringe))
         beyond = points[rim] + cutting.cell * way
         distance, gradient = _slope(field, beyond)
@@ -304,7 +304,7 @@ def smooth_borders(field: Field, points: NDArray, faces: NDArray, cutting: Cutti
     return points
 
 
-def _averaged(values: NDArray, links: NDArray[np.int64]) -> NDArray[np.float64]:
+def averaged(values: NDArray, links: NDArray[np.int64]) -> NDArray[np.float64]:
     """Values (B, 3) along closed borders, each half its own and half its two neighbours'."""
     sums = np.zeros_like(values)
     np.add.at(sums, links[:, 0], values[links[:, 1]])

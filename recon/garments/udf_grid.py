@@ -79,7 +79,9 @@ def slope(field: Field, points: Tensor) -> tuple[Tensor, Tensor]:
     return distance.detach(), gradient
 
 
-def find_band(field: Field, box: Box, resolution: int, steepness: float = 1.1, floor: float = 0.0) -> Band:
+def find_band(
+    field: Field, box: Box, resolution: int, steepness: float = 1.1, floor: float = 0.0, slopes: bool = True
+) -> Band:
     """All cells of a grid of ``resolution`` cells along the box's longest side that a surface may cross.
 
     Args:
@@ -88,6 +90,7 @@ def find_band(field: Field, box: Box, resolution: int, steepness: float = 1.1, f
         resolution: cells along the longest side; cells are cubes.
         steepness: bound on the length of the field's gradient; more than 1 for learned fields.
         floor: distance that the field may still show on the surface [m]; 0 for exact fields.
+        slopes: ask for gradients, too; else they are zero.
     """
     low, extent = np.array(box.low), np.array(box.high) - np.array(box.low)
     cell = float(extent.max()) / resolution
@@ -106,6 +109,8 @@ def find_band(field: Field, box: Box, resolution: int, steepness: float = 1.1, f
         keep = (by_cell.min(1) < reach) & (by_cell.max(1) < 2 * reach)
         used, corners = np.unique(corners[keep], return_inverse=True)
         at, corners = at[used], corners.reshape(-1, 8)
+    if not slopes:
+        return Band(at, low, cell, distance[used], np.zeros((len(at), 3)), corners)
     _, gradient = slope(field, torch.as_tensor(low + at * cell, dtype=torch.float32))
     steep = gradient.double().numpy()
     steep = steep / np.maximum(np.linalg.norm(steep, axis=1, keepdims=True), 1e-9)

@@ -208,6 +208,10 @@ class CbnDecoder(nn.Module):
 
     def run(self, layers: list[Folded], x: Tensor) -> Tensor:
         """Folded layers at x (B, N, 3), or (N, 3) for one code -> distance over δ (B, N) or (N,)."""
+        return self.head(self.outputs(layers, x))
+
+    def outputs(self, layers: list[Folded], x: Tensor) -> Tensor:
+        """What the head makes distances of, (B, N, 1 or 2) or (N, 1 or 2)."""
         linear = torch.addmm if layers[0].weight.dim() == 2 else torch.baddbmm
         half = torch.is_autocast_enabled(x.device.type)
         with torch.autocast(x.device.type, enabled=False):  # places in half precision would blur the surface
@@ -219,10 +223,11 @@ class CbnDecoder(nn.Module):
             h = h + F.relu(linear(layers[k + 1].bias.to(h.dtype), step, layers[k + 1].weight.to(h.dtype)))
         last = layers[-1]
         with torch.autocast(x.device.type, enabled=False):
-            return self.head(linear(last.bias, h.float(), last.weight))
+            return linear(last.bias, h.float(), last.weight)
 
     def head(self, out: Tensor) -> Tensor:
         """Raw outputs (..., 1 or 2) -> distance over δ (...,)."""
+        out = out.float()
         if self.shape.head == "sigmoid":
             return out[..., 0].sigmoid()
         return (out.square().sum(-1) + 1e-8).sqrt()

@@ -16,6 +16,8 @@ RADIUS, MIDDLE, HALF, SLOPE = 0.2, 0.82, 0.18, 0.05
 class TubeField(LatentField):
     """The exact unsigned distance of a tube round y: the code's first entry widens it, its second lengthens it."""
 
+    sided = None
+
     def __init__(self, latent: Tensor):
         self.radius, self.half = RADIUS + SLOPE * latent[0], HALF + SLOPE * latent[1]
 
@@ -45,3 +47,20 @@ class TubeDecoder(UdfDecoder):
     def field(self, latent: Tensor, half: bool = False) -> TubeField:
         """The exact field of a code (2,)."""
         return TubeField(latent)
+
+
+class SidedTube(TubeField):
+    """The same tube, that also tells across from beside."""
+
+    def sides(self, points: Tensor) -> Tensor:
+        """(N, 3) [m] -> (N, 2) [m]."""
+        across = (points[:, [0, 2]].square().sum(1) + 1e-12).sqrt() - self.radius
+        return torch.stack([across, torch.relu((points[:, 1] - MIDDLE).abs() - self.half)], 1)
+
+    def sides_slope(self, points: Tensor, column: int) -> tuple[Tensor, Tensor]:
+        """One of both (N,) and its gradient (N, 3), detached."""
+        with torch.enable_grad():
+            x = points.detach().requires_grad_()
+            one = self.sides(x)[:, column]
+            (gradient,) = torch.autograd.grad(one.sum(), x)
+        return one.detach(), gradient

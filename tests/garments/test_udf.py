@@ -8,7 +8,7 @@ import torch
 
 from pipelines import train_udf as t
 from pipelines.encode import Encode, encode
-from pipelines.udf_samples import Sampling, bounds, collect, draw_places
+from pipelines.udf_samples import Sampling, bounds, collect, draw_places, sides_of
 from recon.files.meshes import write_obj
 from recon.garments import load_decoder
 from recon.garments.dataset import Item
@@ -144,9 +144,19 @@ def test_decoded_garments_are_manifold_and_without_panels(trained):
     assert torch.equal(g.mesh.vertices, again.mesh.vertices)
 
 
-def test_gradients_into_the_code_against_finite_differences(trained):
-    """How far vertices go when the code moves, against where the field then is zero."""
-    decoder, *_ = trained
+@pytest.mark.parametrize(("sided", "most"), [(True, 0.05), (False, 0.08)])
+def test_gradients_into_the_code_against_finite_differences(trained, monkeypatch, sided, most):
+    """How far vertices go when the code moves, against where the surface then is.
+
+    Without knowing sides so short a training leaves the field rough (5.3 % here): the target of 5 % is held on closed
+    forms in test_mesh_udf then. So is that of borders, in test_udf_sides: this decoder has learned next to nothing of
+    where surfaces end.
+    """
+    decoder, _, _, tubes = trained
+    monkeypatch.setattr("pipelines.udf_samples.ONE_WAY", 10.0)  # however unsure they are: derivatives hold anyway
+    monkeypatch.setattr("pipelines.udf_samples.ONE_SIDE", 0.0)
+    sides = sides_of(decoder, [g.mesh for g in tubes]) if sided else None
+    decoder = UdfDecoder(decoder.nets, decoder.all_codes, decoder.known, sided=sides)
     z = decoder.codes[0]
     way = decoder.codes[1] - z
     g = decoder.decode(z, 64)
@@ -158,13 +168,11 @@ def test_gradients_into_the_code_against_finite_differences(trained):
     with torch.no_grad():
         ahead, behind = (decoder.decode_like(z + s * h * way, g).mesh.vertices for s in (1, -1))
     slope = (ahead - behind) / (2 * h)
-    # So short a training leaves the field rough (5.3 % here), most of all beside borders; the target of 5 % is held on
-    # closed forms in test_mesh_udf, and a trained decoder's figure is the benchmark's.
-    inner = torch.ones(len(slope), 1)
-    inner[Frame.of(g.mesh).border] = 0
-    wanted = (slope * inner).square().sum()
-    (found,) = torch.autograd.grad((moved * slope * inner).sum(), step)
-    assert abs(float(found / wanted) - 1) < 0.08
+    chosen = torch.ones(len(slope), 1)
+    chosen[Frame.of(g.mesh).border] = 0
+    wanted = (slope * chosen).square().sum()
+    (found,) = torch.autograd.grad((moved * slope * chosen).sum(), step)
+    assert abs(float(found / wanted) - 1) < most
 
 
 def test_codes_do_not_depend_on_the_order_or_number_of_points_much(trained):

@@ -135,6 +135,8 @@ def test_results_without_patterns_say_why(values, photo, refined: Refined, tmp_p
     assert said["decoder"] == "udf" and any("no sewing pattern" in note for note in said["notes"])
     figures = said["garments"]["skirt"]
     assert 0.9 < figures["stretch_p95"] < 2 and figures == result.figures["garments"]["skirt"]
+    coded, body = result.layers[0].coded, result.body.vertices
+    assert coded is not None and (coded.mean(0) - body.mean(0)).norm() < 0.3  # in the same world as all else
     page = (tmp_path / "report.html").read_text()
     assert "No sewing patterns" in page and "patterns/" not in page and "<h2>Sewing patterns" not in page
     text = (tmp_path / "skirt.obj").read_text()
