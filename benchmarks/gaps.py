@@ -286,7 +286,7 @@ def page(found: dict) -> str:
     t, s = found["table4_ms"], found["solver"]
     lines += ["", "## Table 4: time", ""]
     lines += [
-        f"{t['one_by_one']} ms a frame one by one, skeleton posed too ({t['with_body_mesh']} with the body's own mesh);",
+        f"{t['one_by_one']} ms a frame one by one, skeleton posed too ({t['with_body_mesh']} with the body's mesh);",
         f"{t['at_once']} ms all at once, mesh and all (garment of 5000 vertices).",
     ]
     lines += [
