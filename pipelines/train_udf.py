@@ -104,7 +104,8 @@ def train_udf(config: TrainUdf) -> Path:
     from pipelines.eval_udf import evaluate
 
     tests = [item for kind in FAMILIES[config.family] for item in _items(config, kind, "test")[: config.evaluate]]
-    return store(decoder, config, done, {"unseen": evaluate(decoder, tests)})
+    both: dict[str, object] = {"unseen_encoded": evaluate(decoder, tests), "unseen": evaluate(decoder, tests, steps=60)}
+    return store(decoder, config, done, both)
 
 
 def _items(config: TrainUdf, kind: str, split: str) -> list[Item]:
