@@ -180,9 +180,8 @@ def _placed(clip: Clip, pose: NDArray, body, joints: NDArray) -> NDArray:
         hip, knee, ankle = (joints[JOINT_NAMES.index(n)] for n in ("l_hip", "l_knee", "l_ankle"))
         root *= (np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee)) / max(theirs, 1e-6)
         root -= joints[0]
-    posed = chain(rotation_matrices(torch.as_tensor(pose)), torch.as_tensor(joints)[None].expand(len(pose), -1, -1))[
-        1
-    ].numpy()
+    turned = rotation_matrices(torch.as_tensor(pose))
+    posed = chain(turned, torch.as_tensor(joints)[None].expand(len(pose), -1, -1))[1].numpy()
     feet = posed[:, FEET, 1].min(1) + root[:, 1]
     root[:, 1] += joints[FEET, 1].min() - np.quantile(feet, 0.02)
     return root - root[0] * [1.0, 0.0, 1.0]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from recon.garments.panels import SNAP, border_edges, border_loops, cut_triangles, split_pinches
+from recon.garments.panels import SNAP, border_edges, border_loops, cut_at_signs, split_pinches
 from recon.garments.udf_grid import Field, slope
 
 NOTCHES = 3
@@ -80,10 +80,7 @@ def trim(field: Field, points: NDArray, faces: NDArray, cutting: Cutting) -> tup
     sign[inner[left < near]] = 0
     if (sign < 0).sum() < 3:
         return points, faces[:0]
-    faces, cuts = cut_triangles(faces, sign, len(points))
-    pairs, which = np.unique(cuts, axis=0, return_inverse=True)
-    is_cut = faces >= len(points)
-    faces[is_cut] = len(points) + which.ravel()[faces[is_cut] - len(points)]
+    faces, pairs = cut_at_signs(faces, sign)
     a, b = pairs.T
     share = np.clip(1 - _share(points, a, b, distance, gradient), 0.15, 0.85)[:, None]
     border = np.concatenate([points[sign == 0], points[a] + share * (points[b] - points[a])])

@@ -134,6 +134,19 @@ def cut_triangles(triangles: NDArray, sign: NDArray, base: int) -> tuple[NDArray
     return np.concatenate(faces), np.concatenate(edges)
 
 
+def cut_at_signs(faces: NDArray, sign: NDArray) -> tuple[NDArray, NDArray]:
+    """Faces of a mesh's part where ``sign`` (V,) is not positive, and its cut edges (K, 2), inner end first, each once.
+
+    Indices from V on point into those edges; they may share ends.
+    """
+    count = len(sign)
+    faces, cuts = cut_triangles(faces, sign, count)
+    pairs, which = np.unique(cuts, axis=0, return_inverse=True)
+    fresh = faces >= count
+    faces[fresh] = count + which.ravel()[faces[fresh] - count]
+    return faces, pairs
+
+
 def _place(faces: NDArray, cuts: NDArray, distance: NDArray, sign: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     """Merge equal cut vertices, drop unused ones, give every vertex its place; last, who may lie on the border."""
     n = int(len(distance) ** 0.5)

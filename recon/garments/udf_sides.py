@@ -21,7 +21,7 @@ from torch import Tensor
 from recon.garments.marching import march
 from recon.garments.mesh_udf import Frame, Meshing, turned_out
 from recon.garments.mesh_udf_border import areas, averaged, compact
-from recon.garments.panels import SNAP, border_edges, cut_triangles, split_pinches
+from recon.garments.panels import SNAP, border_edges, cut_at_signs, split_pinches
 from recon.garments.udf_grid import Box, find_band
 from recon.types import Mesh
 
@@ -125,10 +125,7 @@ def cut_level(points: NDArray, faces: NDArray, over: NDArray, near: float) -> tu
     sign[inner[share * size < near]] = 0
     if (sign < 0).sum() < 3:
         return points, faces[:0]
-    faces, cuts = cut_triangles(faces, sign, len(points))
-    pairs, which = np.unique(cuts, axis=0, return_inverse=True)
-    fresh = faces >= len(points)
-    faces[fresh] = len(points) + which.ravel()[faces[fresh] - len(points)]
+    faces, pairs = cut_at_signs(faces, sign)
     a, b = pairs.T
     share = np.clip(over[a] / np.minimum(over[a] - over[b], -1e-12), 0.15, 0.85)[:, None]
     return np.concatenate([points, points[a] + share * (points[b] - points[a])]), faces

@@ -24,6 +24,13 @@ def made_body(body) -> BodyPose:
     return BodyPose(shape, a_pose(1, 50.0), torch.tensor([[0.05, -0.9, -2.8]]))
 
 
+def made_values(body) -> dict[str, torch.Tensor]:
+    """That body and the camera as a fit's parameters."""
+    true = made_body(body)
+    place = {"shape": true.shape, "pose": true.pose, "translation": true.translation}
+    return {**place, "log_focal": torch.tensor(264.0).log(), "pitch": torch.tensor(0.0)}
+
+
 def made_photo(body) -> Photo:
     """The naked body's photo: its silhouette, its landmarks, and two garment masks cut out of the silhouette."""
     camera, posed = made_camera(), body.pose(made_body(body))

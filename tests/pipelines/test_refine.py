@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import log
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from recon.garments import patterns
 from recon.garments.patterns_body import Measures
 from recon.garments.patterns_drape import FittingRoom
 from recon.render.labels import LabelRenderer
-from tests.pipelines.made import SIZE, made_body, made_photo
+from tests.pipelines.made import SIZE, made_photo, made_values
 
 BODY = load_body()
 PHOTO = made_photo(BODY)
@@ -32,9 +31,7 @@ QUICK = Refinement(dressing=Dressing(frames=3, steps=5), settle=3, rounds=1, ste
 @pytest.fixture(scope="module")
 def values() -> dict[str, torch.Tensor]:
     """Body and camera of the made photo."""
-    true = made_body(BODY)
-    place = {"shape": true.shape, "pose": true.pose, "translation": true.translation}
-    return {**place, "log_focal": torch.tensor(log(264.0)), "pitch": torch.tensor(0.0)}
+    return made_values(BODY)
 
 
 @pytest.fixture(scope="module")

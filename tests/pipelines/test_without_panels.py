@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from math import log
 from pathlib import Path
 
 import pytest
@@ -29,7 +28,7 @@ from recon.render.labels import LabelRenderer
 from recon.types import Garment, Photo, UserError
 from tests.garments.exact_udf import MIDDLE, SLOPE, TubeDecoder
 from tests.garments.fields import integral
-from tests.pipelines.made import SIZE, made_body, made_camera, made_photo
+from tests.pipelines.made import SIZE, made_camera, made_photo, made_values
 
 BODY = load_body()
 DECODER = TubeDecoder()
@@ -41,9 +40,7 @@ QUICK = Refinement(dressing=Dressing(frames=3, steps=5), settle=3, rounds=1, ste
 @pytest.fixture(scope="module")
 def values() -> dict[str, torch.Tensor]:
     """Body and camera of the made photo."""
-    true = made_body(BODY)
-    place = {"shape": true.shape, "pose": true.pose, "translation": true.translation}
-    return {**place, "log_focal": torch.tensor(log(264.0)), "pitch": torch.tensor(0.0)}
+    return made_values(BODY)
 
 
 @pytest.fixture(scope="module")
