@@ -19,8 +19,9 @@ from torch import Tensor
 
 from pipelines.fit_body import to_body
 from recon.bodies import Body
-from recon.bodies.pose_prior import pose_prior
+from recon.bodies.pose_prior import pose_prior, sample_poses
 from recon.bodies.poses import a_pose
+from recon.bodies.rig import JOINT_NAMES
 from recon.cloth.contact import BodyContact
 from recon.descend import Descent, descend
 from recon.garments import NAMES
@@ -35,6 +36,8 @@ NEVER: dict[str, tuple[str, ...]] = {
     "skirt": ("head", "neck", "hands", "forearms", "upper_arms"),
 }
 """Garment kind -> regions of the body that it never lies next to."""
+ARMS = tuple([JOINT_NAMES.index(f"{side}_{part}") for part in ("collar", "shoulder", "elbow", "wrist")] for side in "lr")
+"""The joints of each arm."""
 ENDS = ("head", "upper_arms", "forearms", "hands", "feet")
 """Regions that a scan shows, bare or closely clothed."""
 
@@ -59,16 +62,20 @@ class ScanBodyFit:
     """Distances at which points stop pulling harder, from coarse to fine [m]."""
     kept: tuple[int, ...] = (24, 8, 4)
     """How many starts each of these goes on with."""
+    varied: int = 16
+    """Bodies with other arms, likely ones, that join the best after the first of these."""
     finalists: int = 2
     """How many go on against the body's surface."""
     coarse: Descent = field(default_factory=lambda: Descent(steps=45, patience=45))
     """Each of the first descents."""
-    fine: tuple[tuple[float, Descent], ...] = (
-        (0.05, Descent(steps=30, patience=30, rate=0.5)),
-        (0.02, Descent(steps=60, patience=20, rate=0.4, tolerance=5e-4)),
+    fine: tuple[tuple[float, float, Descent], ...] = (
+        (0.05, 0.1, Descent(steps=30, patience=30, rate=0.5)),
+        (0.02, 0.3, Descent(steps=50, patience=30, rate=0.3)),
+        (0.015, 1.0, Descent(steps=40, patience=20, rate=0.15, tolerance=5e-4)),
     )
-    """The last descents: distance at which a skin point stops pulling harder [m], and steps. All finalists take the
-    first, the best one the others."""
+    """The last descents: distance at which a skin point stops pulling harder [m], weight of garments' points that are
+    inside of the body (unit: 1 cm), and steps. All finalists take the first, the best one the others. The weight
+    grows: at first an arm that is a centimetre off would leave its sleeve by the nearest way, and never come back."""
     cloth: float = 0.05
     """The same of a garment's point."""
     slack: float = 0.25
@@ -78,8 +85,6 @@ class ScanBodyFit:
     two-way, since a limb in empty space has no points to answer for."""
     gap: float = 0.003
     """Garments' points are outside of the body by this much at least [m]."""
-    outside: float = 3.0
-    """Weight of garments' points that are not (unit: 1 cm)."""
     prior: float = 0.004
     """Weight of the pose prior."""
     shape: float = 0.004
@@ -110,8 +115,8 @@ def fit_scan_body(
     else:
         starts = {"shape": start.shape, "pose": start.pose, "translation": start.translation}
     left = [{k: v[i : i + 1] for k, v in starts.items()} for i in range(len(starts["pose"]))]
-    for reach, plan in settings.fine:
-        loss = SurfaceLoss(scan, body, settings, settings.fine_points, reach)
+    for reach, outside, plan in settings.fine:
+        loss = SurfaceLoss(scan, body, settings, settings.fine_points, reach, outside)
         ends = [descend(values, PARAMETERS, loss, plan, tick) for values in left]
         left = [min(ends, key=lambda end: end.loss).values]
     return left[0]
@@ -121,10 +126,12 @@ def search(scan: Scan, body: Body, settings: ScanBodyFit, tick=None) -> dict[str
     """The best ``finalists`` of many starts, found on few points, best first."""
     values = all_starts(scan, body, settings)
     loss = CloudLoss(scan, body, settings)
-    for reach, kept in zip(settings.reaches, settings.kept, strict=True):
+    for number, (reach, kept) in enumerate(zip(settings.reaches, settings.kept, strict=True)):
         with torch.no_grad():
             best = loss.at(reach).each(values).argsort()[:kept]
         values = {k: v[best] for k, v in values.items()}
+        if number == 1:
+            values = with_other_arms(values, settings.varied)
         values = descend(values, PARAMETERS, lambda v: loss.each(v).sum(), settings.coarse, tick).values
     with torch.no_grad():
         best = loss.at(settings.reaches[-1]).each(values).argsort()[: settings.finalists]
@@ -150,6 +157,20 @@ def all_starts(scan: Scan, body: Body, settings: ScanBodyFit) -> dict[str, Tenso
     place = middle - (v.amin(0) + v.amax(0)) / 2
     place[1] = low - v[:, 1].min()
     return {"shape": shape, "pose": pose, "translation": place.expand(n, 3).contiguous()}
+
+
+def with_other_arms(values: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+    """The bodies, and ``count`` more: the same in turn with the arms of random likely poses, one side or both.
+
+    Starts hold both arms alike and straight; from there an arm that is bent behind the back is not found.
+    """
+    number = torch.arange(count, device=values["pose"].device) % len(values["pose"])
+    more = {k: v[number].clone() for k, v in values.items()}
+    other = sample_poses(count, torch.Generator().manual_seed(0)).to(more["pose"])
+    for side, arm in enumerate(ARMS):
+        chosen = torch.arange(count, device=number.device) % 3 != side
+        more["pose"][:, arm] = torch.where(chosen[:, None, None], other[:, arm], more["pose"][:, arm])
+    return {k: torch.cat([v, more[k]]) for k, v in values.items()}
 
 
 def _tall(body: Body, height: float) -> Tensor:
@@ -256,9 +277,12 @@ def apart(scan: Scan, labels: Tensor, body: Body, regions: Tensor) -> Tensor:
 class SurfaceLoss:
     """Distance from scan points to the body's surface: skin on it, cloth outside and near."""
 
-    def __init__(self, scan: Scan, body: Body, settings: ScanBodyFit, count: int, reach: float = 0.02):
-        """``count``: points; ``reach``: distance from the body at which a skin point stops pulling harder [m]."""
-        self.body, self.settings, self.reach = body, settings, reach
+    def __init__(
+        self, scan: Scan, body: Body, settings: ScanBodyFit, count: int, reach: float = 0.02, outside: float = 1.0
+    ):
+        """``count``: points; ``reach``: distance from the body at which a skin point stops pulling harder [m];
+        ``outside``: weight of garments' points inside of the body (unit: 1 cm)."""
+        self.body, self.settings, self.reach, self.outside = body, settings, reach, outside
         self.points, labels = few(scan, count)
         self.skin = labels == 0
         index = thinned(body, settings.cell / 2)
@@ -281,7 +305,7 @@ class SurfaceLoss:
             loss = loss + geman(on, self.reach)
         if len(off):
             inside = F.relu(s.gap - off) / 0.01
-            loss = loss + s.slack * geman(off, s.cloth) + s.outside * (inside.square() / (1 + 0.1 * inside)).mean()
+            loss = loss + s.slack * geman(off, s.cloth) + self.outside * (inside.square() / (1 + 0.1 * inside)).mean()
         return loss
 
 
