@@ -20,12 +20,18 @@ from recon.files.meshes import write_obj
 from recon.files.user_garments import read_garment_mesh
 from recon.files.weights import read_manifest, read_weights
 from recon.garments import COMMON
+from recon.garments.latents import nearest
 from recon.garments.udf import FAMILIES, UdfDecoder, family_of, load_udf
+from recon.garments.udf_codes import CodeSearch, best_start, refined
 from recon.metrics import sample_surface, surface_distance
 from recon.types import Mesh, UserError
 
 FEW, MANY = 2000, 10000
 """Surface points: to choose among guesses, and for the code."""
+BESIDE, FINALISTS = 3, 4
+"""Learned codes that are asked beside each guess's own; guesses for which all of them are."""
+PRIOR = 1e-3
+"""Weight of the codes' prior in refinement."""
 WELL, ROUGHLY = 1.5, 3.0
 """Distances, as multiples of what unseen garments of the data set have, up to which a garment is known so well."""
 
@@ -70,8 +76,8 @@ class Guess:
     points: Tensor
     """(N, 3) in place [m]."""
     latent: Tensor
-    distance: float
-    """Mean distance of the points from the decoder's surface [m]."""
+    misfit: float
+    """How far the decoder's field is from the mesh's, in units of δ."""
 
 
 def encode(config: Encode) -> dict[str, Any]:
@@ -101,7 +107,7 @@ def encode(config: Encode) -> dict[str, Any]:
     points = sample_surface(placed, MANY, generator)[0]
     latent = best.decoder.encode(points)
     if config.refine:
-        latent = best.decoder.refine(latent, points, config.refine)
+        latent = _searched(config, best.decoder, latent, points)
     notes += _told(config, best)
     found = _report(config, best, latent, points) | {"mesh": str(path), "notes": notes}
     if target is not None:
@@ -110,7 +116,8 @@ def encode(config: Encode) -> dict[str, Any]:
 
 
 def _best(config: Encode, mesh: Mesh) -> Guess:
-    """The guess whose decoded field is closest to the mesh."""
+    """The guess whose decoded field is closest to the mesh: of the best few by their encoded codes and the learned
+    ones beside those, the best by all learned codes."""
     kinds = list(COMMON) if config.kind == "auto" else [config.kind]
     ups = ("y", "z") if config.up == "auto" else (config.up,)
     families = {family_of(k): k for k in kinds}
@@ -123,12 +130,35 @@ def _best(config: Encode, mesh: Mesh) -> Guess:
         for up in ups:
             for turned in (False, True):
                 guesses += _places(config, decoder, _turn(mesh, up, turned), up, turned)
-    return min(guesses, key=lambda guess: guess.distance)
+    guesses = sorted(guesses, key=lambda guess: guess.misfit)[:FINALISTS]
+    if len(guesses) == 1:
+        return guesses[0]
+    return min(guesses, key=lambda g: _start(config, g.decoder, g.latent, g.points)[1])
+
+
+def _learned(config: Encode, decoder: UdfDecoder) -> Tensor:
+    """(n, Z) learned codes of the kind, or of the whole family where none is named."""
+    return decoder.all_codes if config.kind == "auto" else decoder.codes
+
+
+def _start(config: Encode, decoder: UdfDecoder, latent: Tensor, points: Tensor) -> tuple[Tensor, float]:
+    """The best of a code and all learned ones, and its misfit."""
+    codes = torch.cat([latent[None], _learned(config, decoder)])
+    return best_start(decoder, codes, points, decoder.nets.shape.reach)
+
+
+def _searched(config: Encode, decoder: UdfDecoder, latent: Tensor, points: Tensor) -> Tensor:
+    """The code refined, from the encoder's and from the learned one that fits best; the better of both ends."""
+    reach, how = decoder.nets.shape.reach, CodeSearch(config.refine, far=0.1, stay=0.0, prior=PRIOR)
+    start = _start(config, decoder, latent, points)[0]
+    starts = [latent] if torch.equal(start, latent) else [latent, start]
+    ends = torch.stack([refined(decoder, z, points, reach, how) for z in starts])
+    return best_start(decoder, ends, points, reach)[0]
 
 
 def _places(config: Encode, decoder: UdfDecoder, mesh: Mesh, up: str, turned: bool) -> list[Guess]:
     points = sample_surface(mesh, FEW, torch.Generator().manual_seed(config.seed))[0]
-    guesses = [_guess(decoder, points, torch.zeros(3), up, turned)]
+    guesses = [_guess(config, decoder, points, torch.zeros(3), up, turned)]
     if config.place == "auto":
         shape = decoder.nets.shape
         middle = (points.amax(0) + points.amin(0)) / 2
@@ -136,16 +166,17 @@ def _places(config: Encode, decoder: UdfDecoder, mesh: Mesh, up: str, turned: bo
         for drop in (0.0, 0.04, 0.08, 0.14):
             shift = points.new_tensor(shape.centre) - middle
             shift[1] = high[1] - drop
-            guesses.append(replace(_guess(decoder, points, shift, up, turned), moved=True))
+            guesses.append(replace(_guess(config, decoder, points, shift, up, turned), moved=True))
     return guesses
 
 
-def _guess(decoder: UdfDecoder, points: Tensor, shift: Tensor, up: str, turned: bool) -> Guess:
+def _guess(config: Encode, decoder: UdfDecoder, points: Tensor, shift: Tensor, up: str, turned: bool) -> Guess:
     at = points + shift
     latent = decoder.encode(at)
-    with torch.no_grad():
-        distance = float(decoder.field(latent, half=True)(at).mean())
-    return Guess(decoder, up, turned, False, shift, at, latent, distance)
+    codes = _learned(config, decoder)
+    beside = codes[nearest(codes, latent, BESIDE)]
+    latent, misfit = best_start(decoder, torch.cat([latent[None], beside]), at, decoder.nets.shape.reach)
+    return Guess(decoder, up, turned, False, shift, at, latent, misfit)
 
 
 def _turn(mesh: Mesh, up: str, turned: bool) -> Mesh:
@@ -174,8 +205,8 @@ def _report(config: Encode, best: Guess, latent: Tensor, points: Tensor) -> dict
     decoder = best.decoder
     with torch.no_grad():
         distance = 1e3 * float(decoder.field(latent)(points).mean())
-    nearest = int((decoder.all_codes - latent).square().sum(1).argmin())
-    kind = decoder.known[nearest].kind if config.kind == "auto" else config.kind
+    alike = int(nearest(decoder.all_codes, latent)[0])
+    kind = decoder.known[alike].kind if config.kind == "auto" else config.kind
     card = read_weights(f"udf-{family_of(kind)}", config.weights).card
     usual = float(card.get("metrics", {}).get("unseen", {}).get("field_mm", 0.0))
     share = distance / usual if usual else float("nan")
@@ -189,7 +220,7 @@ def _report(config: Encode, best: Guess, latent: Tensor, points: Tensor) -> dict
         "distance_mm": round(distance, 3),
         "usual_mm": usual,
         "known": known,
-        "nearest": decoder.known[nearest].variant,
+        "nearest": decoder.known[alike].variant,
         "up": best.up,
         "turned": best.turned,
         "shift": [round(v, 5) for v in best.shift.tolist()],

@@ -36,7 +36,8 @@ NEVER: dict[str, tuple[str, ...]] = {
     "skirt": ("head", "neck", "hands", "forearms", "upper_arms"),
 }
 """Garment kind -> regions of the body that it never lies next to."""
-ARMS = tuple([JOINT_NAMES.index(f"{side}_{part}") for part in ("collar", "shoulder", "elbow", "wrist")] for side in "lr")
+ARM = ("collar", "shoulder", "elbow", "wrist")
+ARMS = tuple([JOINT_NAMES.index(f"{side}_{part}") for part in ARM] for side in "lr")
 """The joints of each arm."""
 ENDS = ("head", "upper_arms", "forearms", "hands", "feet")
 """Regions that a scan shows, bare or closely clothed."""

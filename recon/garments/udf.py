@@ -13,6 +13,7 @@ from torch import Tensor
 
 from recon.files.weights import read_weights
 from recon.garments.mesh_udf import Frame, Meshing, chase, follow, mesh_udf
+from recon.garments.udf_codes import CodeSearch, refined
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import CHUNK, Folded, UdfNets, UdfShape
 from recon.garments.udf_sides import beyond_borders, follow_sides, mesh_sides
@@ -221,30 +222,8 @@ class UdfDecoder:
         return self.nets.encoder(x[None], rows[None])[0]
 
     def refine(self, latent: Tensor, points: Tensor, steps: int = 60, rate: float = 0.03) -> Tensor:
-        """The code (Z,) near ``latent`` whose field is smallest at surface points (N, 3) [m] and large elsewhere.
-
-        Distances at the points fall; that the surface ends where they end is told by places beside the points.
-        """
-        generator = torch.Generator().manual_seed(0)
-        tree = cKDTree(points.cpu().numpy())
-        z = latent.detach().clone().requires_grad_()
-        adam = torch.optim.Adam([z], lr=rate)
-        best, least = latent.detach(), float("inf")
-        for step in range(steps):
-            for group in adam.param_groups:
-                group["lr"] = rate * (1 - 0.9 * step / steps)
-            pick = points[torch.randint(len(points), (1500,), generator=generator)]
-            beside = pick[:750] + 0.03 * torch.randn(750, 3, generator=generator)
-            wanted = torch.as_tensor(tree.query(beside.numpy())[0], dtype=pick.dtype).clamp(max=self.nets.shape.reach)
-            field = self.field(z)
-            off = field(pick).mean() + (field(beside) - wanted).abs().mean()
-            loss = off / self.nets.shape.reach + 1e-3 * (z - latent.detach()).square().mean()
-            adam.zero_grad()
-            loss.backward()
-            adam.step()
-            if float(loss.detach()) < least:
-                best, least = z.detach().clone(), float(loss.detach())
-        return best
+        """The code (Z,) near ``latent`` whose field is smallest at surface points (N, 3) [m] and large elsewhere."""
+        return refined(self, latent, points, self.nets.shape.reach, CodeSearch(steps, rate))
 
 
 def family_of(kind: str) -> str:
