@@ -10,7 +10,8 @@ in poses of the held-out clip where it is at hand. Every way of draping meets th
 - drapenet: Eq. 6 whole; bottoms under a top with and without the intersection solver (Eq. 9);
 - skinning: Eq. 6 without dx_ref: the product's geometry-aware skinning, settled along the cloth, which the networks
   learned on (``DrapeShape.skinning``);
-- field: the same with the skinning field that is learned from the body alone, as in the paper.
+- field: the same with the skinning field that is learned from the body alone, as in the paper;
+- steps: projective steps after either (``recon.draping.projected``), as ``recon drape`` takes them.
 
 B2G: share of the garment's area with its middle inside the body. G2G: share of the bottom's area outside of the top
 that covers it. ED: mean distance of vertices from the simulator's drape (``recon.draping.dress``), which is one of many
@@ -38,6 +39,7 @@ from recon.cloth.energies import Cloth, bending, gravity, stvk
 from recon.draping.drapenet import DrapeNetDraper, Prepared, load_drapenet
 from recon.draping.dress import dress
 from recon.draping.layering import Beneath
+from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest
 from recon.garments.dataset import load_garments
@@ -45,7 +47,6 @@ from recon.metrics import areas_and_middles, inside_pct
 from recon.types import BodyPose, Garment, Mesh, PosedBody
 
 GROUPS = {"top": ("top", "dress"), "bottom": ("trousers", "skirt")}
-WAYS = ("drapenet", "field", "skinning")
 TERMS = ("strain", "bending", "gravity")
 
 
@@ -76,7 +77,9 @@ def ways(draper: DrapeNetDraper, skinning: SkinningDraper) -> dict[str, Callable
         none = torch.zeros(len(body.shape), len(ready.rest), 3)
         return Mesh(ready.place(none, body), garment.mesh.faces)
 
-    return {"drapenet": draper.drape, "field": field, "skinning": skinning.drape}
+    steps = ProjectedDraper(draper, skinning), ProjectedDraper(skinning, skinning)
+    stepped = {"drapenet, steps": steps[0].drape, "skinning, steps": steps[1].drape}
+    return {"drapenet": draper.drape, "field": field, "skinning": skinning.drape, **stepped}
 
 
 def energies(cloth: Cloth, x: torch.Tensor, floor: float) -> dict[str, float]:
@@ -210,7 +213,10 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
     drapes = simulated(size, body, how, skinning)
     ed = {g: means([r for r in drapes if r["kind"] in kinds], ("ed_mm",)) for g, kinds in GROUPS.items()}
     parts = read_manifest(weights)["drapenet"]["parts"]
-    ratio = {g: round(t["drapenet"]["strain"] / t["skinning"]["strain"], 4) for g, t in table.items()}
+    ratio = {
+        g: {w: round(t[w]["strain"] / t["skinning"]["strain"], 4) for w in ("drapenet", "drapenet, steps")}
+        for g, t in table.items()
+    }
     with torch.enable_grad():
         decoder = decoder_figures(quick)
     return {

@@ -38,6 +38,7 @@ from recon.cloth.intersections import Crossings
 from recon.cloth.untangle import untangle
 from recon.draping.isp import IspDraper, load_isp_draper
 from recon.draping.layering import Beneath, Layering, Raster, load_layering
+from recon.draping.projected import ProjectedDraper
 from recon.files.motions import read_clip
 from recon.garments import load_decoder
 from recon.metrics import areas_and_middles, beneath_pct, inside_pct
@@ -90,8 +91,8 @@ def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[G
         return [decoder.decode(between(decoder.codes, generator), resolution) for _ in range(count)]
 
 
-WAYS = ("skinning", "displaced", "layered")
-"""Skinning alone; D_s; D_s, then D_m with the body as the layer beneath."""
+WAYS = ("skinning", "displaced", "layered", "projected")
+"""Skinning alone; D_s; D_s, then D_m with the body as the layer beneath; D_s, then projective steps."""
 
 
 def alone(
@@ -102,7 +103,8 @@ def alone(
     for garment in garments:
         displaced = draper.drape(garment, posed)
         over = layering([garment], [displaced], posed.mesh)[0]
-        ways = dict(zip(WAYS, (draper.skinning.drape(garment, posed), displaced, over), strict=True))
+        stepped = ProjectedDraper(draper, draper.skinning).drape(garment, posed)
+        ways = dict(zip(WAYS, (draper.skinning.drape(garment, posed), displaced, over, stepped), strict=True))
         cloth = Cloth.from_garment(garment)
         for k, skin in enumerate(posed.mesh.vertices):
             contact = BodyContact(skin, body.faces)
@@ -201,11 +203,14 @@ def drape_ms(
     figures = {}
     for kind in draper.nets:
         (garment,) = unseen_garments(kind, 1, resolution, 3)
-        times: dict[str, list[float]] = {"": [], "_prepare": [], "_layer": []}
+        times: dict[str, list[float]] = {"": [], "_prepare": [], "_layer": [], "_steps": []}
+        stepping = ProjectedDraper(draper, draper.skinning)
+        stepping.drape(garment, posed)
         raster, mesh, skin = Raster.of(garment), draper.drape(garment, posed), Beneath.all_of(posed.mesh)
         for _ in range(rounds):
             draper._kept.clear()
             runs = {
+                "_steps": lambda g=garment, s=stepping: s.drape(g, posed),
                 "_prepare": lambda g=garment: draper.prepare(g),
                 "": lambda g=garment: draper.drape(g, posed),
                 "_layer": lambda r=raster, m=mesh, s=skin: layering.over(r, m, s),
@@ -302,9 +307,10 @@ def page(figures: dict) -> str:
     lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
     busy = " (more than its cores: times are too long)" if figures["load"] > (os.cpu_count() or 1) else ""
     lines += [f"Load of the machine when it was measured: {figures['load']}{busy}.", ""]
-    lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once):", ""]
+    lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once;"]
+    lines += ["`_steps`: D_s with projective steps after it):", ""]
     lines += [", ".join(f"{name} {value}" for name, value in figures["drape_ms"].items()), ""]
-    says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body"}
+    says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body", "projected": "D_s, steps"}
     lines += ["![Three garments, each draped alone and then layered](isp-layers.jpg)", ""]
     lines += ["| alone | drapes | by | area inside the body, mean | median | strain | to skinning's | median |"]
     lines += ["|---|---|---|---|---|---|---|---|"]

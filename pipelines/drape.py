@@ -21,10 +21,13 @@ from recon.bodies import Body, load_body
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import self_intersections
+from recon.cloth.projective import Projecting
 from recon.cloth.untangle import Untangled, untangle
 from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.isp import IspDraper
 from recon.draping.layering import Beneath, Layering, load_layering
+from recon.draping.projected import ProjectedDraper
+from recon.draping.skinning import SkinningDraper
 from recon.files.atomic import write_whole
 from recon.files.meshes import Colour, write_glb, write_obj
 from recon.files.weights import folder_with, read_manifest
@@ -47,6 +50,8 @@ class Drape:
     """Folder for the results."""
     draper: str = ""
     """isp, skinning or another of the drapers; "" takes isp for garments with panels and skinning for other meshes."""
+    steps: int = Projecting.steps
+    """Projective steps after the draper: they bring cloth near its lengths and out of the body; 0 = none."""
     decoder: str = "isp"
     """What makes the garments of codes: isp (with panels) or udf (without)."""
     resolution: int = 128
@@ -126,6 +131,8 @@ def _check(config: Drape) -> None:
         raise UserError("garments: found none; wanted at least one, innermost first")
     if config.draper and config.draper not in DRAPERS:
         raise UserError(f"--draper: found {config.draper!r}; wanted one of {', '.join(DRAPERS)}")
+    if config.steps < 0:
+        raise UserError(f"--steps: found {config.steps}; wanted 0 or more")
     if not 16 <= config.resolution <= 1024:
         raise UserError(f"--resolution: found {config.resolution}; wanted 16 to 1024")
     if config.out.exists() and not _is_ours(config.out):
@@ -177,6 +184,7 @@ def drape_each(
     how: list[str] = []
     drapes: list[Mesh] = []
     folder = folder_with("drape", config.weights)
+    skinning, projecting = SkinningDraper(body), Projecting(steps=config.steps)
     isp = load_draper("isp", body, folder) if config.draper in ("", "isp") else None
     for name, thing in zip(config.garments, things, strict=True):
         chosen = config.draper
@@ -185,7 +193,8 @@ def drape_each(
             raise UserError(f"{name}: has no panels that draper isp knows; wanted --draper skinning, or {_PANELLED}")
         chosen = chosen or ("isp" if known else "skinning")
         if chosen not in drapers:
-            drapers[chosen] = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, folder)
+            plain = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, folder)
+            drapers[chosen] = ProjectedDraper(plain, skinning, projecting) if config.steps else plain
         garment = thing if isinstance(thing, Garment) else Garment.bare("", thing)
         drapes.append(drapers[chosen].drape(garment, posed, under=drapes))
         how.append(chosen)

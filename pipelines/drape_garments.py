@@ -11,8 +11,8 @@ from recon.bodies import Body
 from recon.cloth.energies import Cloth
 from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
-from recon.garments import WAISTED, GarmentDecoder, load_decoder
-from recon.garments.panels import waistband
+from recon.draping.dress import held_vertices
+from recon.garments import GarmentDecoder, load_decoder
 from recon.types import Garment, Mesh
 
 NEIGHBOURS = 8
@@ -61,9 +61,7 @@ class Wardrobe:
         rings = [OneRings.of(g.mesh.vertices, g.mesh.faces) for g in garments]
         first = FramePhysics(cloths[0], rings[0], rest, weights, frames)
         physics = [first, *(first.dressed(c, r) for c, r in zip(cloths[1:], rings[1:], strict=True))]
-        none = torch.zeros(0, dtype=torch.long)
-        held = [torch.as_tensor(waistband(g)) if g.kind in WAISTED else none for g in garments]
-        return cls(garments, cloths, physics, held)
+        return cls(garments, cloths, physics, [torch.as_tensor(held_vertices(g)) for g in garments])
 
     @classmethod
     def decoded(

@@ -23,6 +23,7 @@ from pipelines.run import Run
 from recon.bodies import Body, load_body
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
+from recon.cloth.projective import Projecting
 from recon.cloth.untangle import Untangling, untangle
 from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping.dress import limits_of
@@ -67,6 +68,8 @@ class Animate:
     """First coefficients of the body's shape; the rest are 0."""
     draper: str = ""
     """gaps, simulate or skinning; "" takes gaps for names of GAPS weights and simulates the rest."""
+    steps: int = Projecting.steps
+    """Projective steps after a GAPS network: they bring cloth near its lengths and out of the body; 0 = none."""
     untangle: bool = True
     """Draw apart what passes through the body, itself or another layer, frame by frame."""
     formats: tuple[str, ...] = ("glb", "gif")
@@ -113,7 +116,7 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     worn: list[Moving] = []
     for k, name in reversed(list(enumerate(config.garments))):
         job = lambda _, name=name: drape(name, config, body, pose, posed, worn)  # noqa: E731
-        thing, frames = run.stage(f"drape-{_file_name(name)}", job, config=config.draper)
+        thing, frames = run.stage(f"drape-{_file_name(name)}", job, config=[config.draper, config.steps])
         worn.insert(0, Moving(thing, frames, layer_colour(k)))
     posed = replace(posed, mesh=posed.mesh.with_vertices(posed.mesh.vertices[LEAD_IN:]))
     worn = [replace(part, frames=part.frames[LEAD_IN:]) for part in worn]
@@ -158,6 +161,8 @@ def _check(config: Animate) -> None:
     names = [_file_name(g) for g in config.garments]
     if len(set(names)) != len(names) or "body" in names:
         raise UserError(f"garments: found {', '.join(names)}; wanted different names, none of them body")
+    if config.steps < 0:
+        raise UserError(f"--steps: found {config.steps}; wanted 0 or more")
     if config.fps <= 0:
         raise UserError(f"--fps: found {config.fps}; wanted a positive number")
     if not config.motion.is_file():
@@ -184,7 +189,7 @@ def drape(
     trained = f"gaps-{name}" in read_manifest(config.weights)
     how = config.draper or ("gaps" if trained else "simulate")
     if how == "gaps":
-        draper = load_gaps(name, body, config.weights)
+        draper = load_gaps(name, body, config.weights, Projecting(steps=config.steps))
         return draper.garment, draper.animate(posed, pose, config.fps)
     thing = load_gaps(name, body, config.weights).garment if trained else load_garment(name)
     rest = thing.mesh if isinstance(thing, Garment) else thing

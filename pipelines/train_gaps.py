@@ -23,10 +23,10 @@ from recon.cloth.energies import Cloth, inertia, towards_template
 from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
+from recon.draping.dress import held_vertices
 from recon.draping.gaps import Bound, GapsNet, GapsShape, motion_features, smooth_basis
 from recon.files.weights import write_weights
-from recon.garments import WAISTED
-from recon.garments.panels import border_loops, waistband
+from recon.garments.panels import border_loops
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
 
 FAR = 0.1
@@ -107,9 +107,7 @@ class Template:
         contact = BodyContact(body.rest(body.neutral().shape).vertices[0], body.faces)
         middle = mesh.vertices[cloth.hinges[:, :2]].mean(1)
         balance = (contact.signed_distance(middle).clamp_min(0) / FAR).clamp(max=1.0)
-        held = torch.zeros(0, dtype=torch.long)
-        if isinstance(thing, Garment) and thing.kind in WAISTED:
-            held = torch.as_tensor(waistband(thing))
+        held = torch.as_tensor(held_vertices(thing))
         return cls(thing, mesh, towards_template(cloth, mesh.vertices, balance), held)
 
 

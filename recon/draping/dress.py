@@ -49,8 +49,15 @@ def limits_of(garment: Garment | Mesh) -> Constraints:
     """
     if isinstance(garment, Mesh):
         return Constraints.from_cloth(Cloth.from_mesh(garment), garment.vertices.detach().double().numpy())
-    held = waistband(garment) if garment.kind in WAISTED else None
-    return Constraints.from_cloth(Cloth.from_garment(garment), garment.mesh.vertices.detach().double().numpy(), held)
+    held, at = held_vertices(garment), garment.mesh.vertices.detach().double().numpy()
+    return Constraints.from_cloth(Cloth.from_garment(garment), at, held if len(held) else None)
+
+
+def held_vertices(garment: Garment | Mesh) -> NDArray:
+    """(H,) vertices of the waistband that holds a garment; none where nothing is known to."""
+    if isinstance(garment, Garment) and garment.kind in WAISTED:
+        return waistband(garment)
+    return np.zeros(0, np.int64)
 
 
 @torch.no_grad()

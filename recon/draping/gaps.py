@@ -20,7 +20,10 @@ from torch import Tensor, nn
 from recon.bodies import Body
 from recon.bodies.rig import rotation_matrices
 from recon.bodies.skin import skin
+from recon.cloth.energies import Cloth
+from recon.cloth.projective import Projecting, Projective
 from recon.draping.binding import METHODS, BodyField, cloth_operators
+from recon.draping.dress import held_vertices
 from recon.files.weights import read_weights
 from recon.types import TWO_PANELS, BodyPose, Garment, Mesh, PosedBody, UserError
 
@@ -164,23 +167,28 @@ class Bound:
 class GapsDraper:
     """Drapes the garment that it was trained on over any motion and shape."""
 
-    def __init__(self, net: GapsNet, garment: Garment | Mesh, bound: Bound):
-        """``garment``: the template, a mesh where it has no panels."""
+    def __init__(self, net: GapsNet, garment: Garment | Mesh, bound: Bound, projective: Projective | None = None):
+        """``garment``: the template, a mesh where it has no panels; ``projective``: steps after the network, if any."""
         self.net = net.eval().requires_grad_(False)
         last = self.net.out  # by columns in memory: one frame's product takes half the time
         last.weight = nn.Parameter(last.weight.T.contiguous().T, requires_grad=False)
         self.garment, self.bound = garment, bound
+        self.projective = projective
 
     @torch.no_grad()
     def animate(self, body: PosedBody, pose: BodyPose, fps: float) -> Tensor:
         """All frames of one motion at once: (F, V, 3) [m]. ``body``: the F posed bodies of ``pose``."""
         features = motion_features(pose.pose[None], pose.translation[None], fps)
         moved, _ = self.net(features, pose.shape[:1], self._warm(features[:, :1], pose.shape[:1]))
-        return self.bound.place(moved[0], body.transforms, pose.shape)
+        drapes = self.bound.place(moved[0], body.transforms, pose.shape)
+        return self.projective(drapes, body) if self.projective else drapes
 
     @torch.no_grad()
     def stream(self, frames: Iterable[BodyPose], body: Body, fps: float) -> Iterator[Tensor]:
-        """One frame after another, each (1, V, 3) [m], as they come; of the body only its skeleton is posed."""
+        """One frame after another, each (1, V, 3) [m], as they come.
+
+        Of the body only its skeleton is posed, unless projective steps need its skin.
+        """
         hidden, before, shape, shaped = None, None, None, None
         for pose in frames:
             rotations = rotation_matrices(pose.pose)
@@ -191,7 +199,8 @@ class GapsDraper:
                 hidden = self._warm(features, shape)
             moved, hidden = self.net(features, shape, hidden)
             before = rotations[:, 0], pose.translation
-            yield skin(shaped + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
+            drape = skin(shaped + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
+            yield self.projective(drape, body.pose(pose)) if self.projective else drape
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
         """The hidden state of a body that has stood still in its first pose."""
@@ -200,20 +209,22 @@ class GapsDraper:
         return self.net.remember(still.expand(-1, WARM_UP, -1), shape)[1]
 
 
-def load_gaps(name: str, body, folder: str | Path | None = None) -> GapsDraper:
+def load_gaps(name: str, body, folder: str | Path | None = None, projecting: Projecting | None = None) -> GapsDraper:
     """The draper called ``gaps-NAME`` from ``folder``, or else from the packaged weights, for a body.
+
+    ``projecting``: projective steps after the network; None = the network alone.
 
     Raises:
         UserError: weights missing or corrupt, or not those of such a network.
     """
     weights = read_weights(f"gaps-{name}", folder)
     try:
-        return build(weights.tensors, weights.card, body)
+        return build(weights.tensors, weights.card, body, projecting)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise UserError(f"gaps-{name}: weights and card don't describe a GAPS network ({error})") from error
 
 
-def build(tensors: dict[str, Tensor], card: dict, body) -> GapsDraper:
+def build(tensors: dict[str, Tensor], card: dict, body, projecting: Projecting | None = None) -> GapsDraper:
     """A draper from its stored parts: the network's parameters and ``garment.*``."""
     net = GapsNet(GapsShape(**card["shape"]))
     net.load_state_dict({k[4:]: v.float() for k, v in tensors.items() if k.startswith("net.")})
@@ -233,4 +244,9 @@ def build(tensors: dict[str, Tensor], card: dict, body) -> GapsDraper:
             vertex_of_point=panels["vertex_of_point"],
             border_labels=panels["border_labels"],
         )
-    return GapsDraper(net, thing, Bound.of(mesh.vertices, mesh.faces, body, card["skinning"]))
+    bound = Bound.of(mesh.vertices, mesh.faces, body, card["skinning"])
+    if projecting is None or not projecting.steps:
+        return GapsDraper(net, thing, bound)
+    # The lengths to keep are the template's, as in Eq. 15.
+    steps = Projective(Cloth.from_mesh(mesh), bound.weights, held_vertices(thing), projecting)
+    return GapsDraper(net, thing, bound, steps)
