@@ -135,7 +135,7 @@ def _unharmed(config: Edit) -> None:
 
 
 def wanted_outline(config: Edit, decoder: IspDecoder, latent: Tensor) -> list[list[Loop]]:
-    """Front's and back's loops after the edit, panel coordinates [m].
+    """Each panel's loops after the edit, panel coordinates [m].
 
     Raises:
         UserError: no edit, one that this garment can't have, or panels beyond what the decoder knows.
@@ -146,7 +146,7 @@ def wanted_outline(config: Edit, decoder: IspDecoder, latent: Tensor) -> list[li
     with torch.no_grad():
         panels = panel_loops(decoder.decode(latent, 128))
     if config.svg is not None:
-        panels = read_svg(config.svg).panels()
+        panels = read_svg(config.svg, decoder.nets.shape.panel_names)
     elif config.sleeve is None and config.length is None and not config.open and not config.close:
         raise UserError("edit: nothing to do; wanted --svg, --sleeve, --length, --open or --close")
     known = known_parameters(decoder.codes, decoder.parameters, latent)

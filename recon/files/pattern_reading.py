@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.types import UserError
+from recon.types import TWO_PANELS, UserError, behind
 
 MM_PER_INCH = 25.4
 CHORD = 1.5
@@ -19,27 +19,14 @@ OPEN = 0.5
 """An outline whose ends are further apart than this is open [mm]."""
 LARGEST, SMALLEST = 3000.0, 100.0
 """A pattern's extent [mm]; outside of this the file is of other units."""
-PANELS = ("front", "back")
 
 
-@dataclass(frozen=True)
-class CutLines:
-    """The outlines of both panels, panel coordinates [m]."""
+def read_svg(path: str | Path, names: Sequence[str] = TWO_PANELS) -> list[list[NDArray[np.float64]]]:
+    """The cut lines of an edited pattern: closed loops (N, 2) of each panel, panel coordinates [m].
 
-    front: list[NDArray[np.float64]]
-    """Closed loops (N, 2), the last point joins the first."""
-    back: list[NDArray[np.float64]]
-
-    def panels(self) -> list[list[NDArray[np.float64]]]:
-        """Front's loops, back's loops."""
-        return [self.front, self.back]
-
-
-def read_svg(path: str | Path) -> CutLines:
-    """The cut lines of an edited pattern.
-
-    Curves, transforms and relative paths are understood. What counts are the paths called ``cut-front...`` and
-    ``cut-back...``; seams, texts and marks may stay as they were.
+    Curves, transforms and relative paths are understood. What counts are the paths called ``cut-front...``,
+    ``cut-back...`` and so on for each of the panels' ``names``; seams, texts and marks may stay as they were. The last
+    point of a loop joins the first.
 
     Raises:
         UserError: missing, no SVG, no physical size, a missing panel, an open outline, outlines that cross, or a
@@ -47,9 +34,9 @@ def read_svg(path: str | Path) -> CutLines:
     """
     path = Path(path)
     svg, origins = _parse(path)
-    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in PANELS}
+    found: dict[str, list[NDArray[np.float64]]] = {name.replace("_", "-"): [] for name in names}
     for element in svg.elements():
-        match = re.match(r"cut-(front|back)\b", str(getattr(element, "id", None) or ""))
+        match = re.match(rf"cut-({'|'.join(found)})\b", str(getattr(element, "id", None) or ""))
         if match is None or not hasattr(element, "as_subpaths"):
             continue
         panel = match[1]
@@ -57,11 +44,11 @@ def read_svg(path: str | Path) -> CutLines:
         if origin is None:
             raise UserError(f"{path}: {element.id} lost its group's data-origin; edit a file of recon decode --pattern")
         loops = [_loop(path, panel, sub) for sub in element.as_subpaths()]
-        mirror = np.array([1.0 if panel == "front" else -1.0, -1.0])
+        mirror = np.array([-1.0 if behind(panel.replace("-", "_")) else 1.0, -1.0])
         found[panel] += [(loop - origin) * mirror / 1000.0 for loop in loops]
-    for panel in PANELS:
-        _check(path, panel, found[panel])
-    return CutLines(found["front"], found["back"])
+    for panel, loops in found.items():
+        _check(path, panel, loops, len(found))
+    return list(found.values())
 
 
 def _parse(path: Path):
@@ -118,9 +105,10 @@ def _loop(path: Path, panel: str, sub) -> NDArray[np.float64]:
     return loop[steps > 1e-4]
 
 
-def _check(path: Path, panel: str, loops: list[NDArray[np.float64]]) -> None:
+def _check(path: Path, panel: str, loops: list[NDArray[np.float64]], count: int) -> None:
     if not loops:
-        raise UserError(f"{path}: no path called cut-{panel}...; wanted the outline of both panels")
+        wanted = "both panels" if count == 2 else f"all {count} panels"
+        raise UserError(f"{path}: no path called cut-{panel}...; wanted the outline of {wanted}")
     size = 1000 * float(np.ptp(np.concatenate(loops), axis=0).max())
     if not SMALLEST < size < LARGEST:
         raise UserError(f"{path}: the {panel} panel is {size:.0f} mm across; wanted true scale, 1 unit = 1 mm")

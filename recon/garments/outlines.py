@@ -35,6 +35,7 @@ class Stretchable:
 
 LENGTHS = {
     "top": Stretchable("neck_y", "armpit_y", 0.05),
+    "shirt6": Stretchable("neck_y", "armpit_y", 0.05),
     "dress": Stretchable("neck_y", "hip_y", 0.02),
     "skirt": Stretchable("waist_y", "hip_y", 0.0),
     "trousers": Stretchable("waist_y", "crotch_y", 0.05),
@@ -108,7 +109,7 @@ def opened(panels: list[list[Loop]], gap: float) -> list[list[Loop]]:
     if len(panels[0]) != 1:
         raise UserError("open: the front is open already")
     front = panels[0][0]
-    return [[_clip(front[::-1] * [-1, 1], gap / 2)[::-1] * [-1, 1], _clip(front, gap / 2)], panels[1]]
+    return [[_clip(front[::-1] * [-1, 1], gap / 2)[::-1] * [-1, 1], _clip(front, gap / 2)], *panels[1:]]
 
 
 def _clip(loop: Loop, x: float) -> Loop:

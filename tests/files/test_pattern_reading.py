@@ -23,8 +23,8 @@ def written(tmp_path, flat_shirt):
 def test_panels_come_back(written):
     shirt, path = written
     cut = read_svg(path)
-    assert [len(loops) for loops in cut.panels()] == [2, 1]
-    for panel, loops in enumerate(cut.panels()):
+    assert [len(loops) for loops in cut] == [2, 1]
+    for panel, loops in enumerate(cut):
         own = shirt.panel_points[shirt.panel_faces[shirt.panel_of_face == panel]].reshape(-1, 2).numpy()
         both = np.concatenate(loops)
         assert np.allclose(both.min(0), own.min(0), atol=1e-5) and np.allclose(both.max(0), own.max(0), atol=1e-5)
@@ -32,16 +32,16 @@ def test_panels_come_back(written):
 
 def test_transforms_and_curves_are_understood(written):
     _, path = written
-    before = read_svg(path).back[0]
+    before = read_svg(path)[1][0]
     text = path.read_text()
     moved = text.replace('id="cut-back"', 'id="cut-back" transform="translate(0 -50)"')
     path.write_text(moved)
-    assert np.allclose(read_svg(path).back[0], before + [0, 0.05], atol=1e-5)
+    assert np.allclose(read_svg(path)[1][0], before + [0, 0.05], atol=1e-5)
     d = re.search(r'id="cut-back"[^>]* d="M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)', text)
     x0, y0, x1, y1 = (float(v) for v in d.groups())
     bent = text.replace(d[0], d[0].rsplit("L", 1)[0] + f"C{x0} {y0 - 20} {x1} {y1 - 20} {x1} {y1}")
     path.write_text(bent)
-    assert len(read_svg(path).back[0]) > len(before) + 5
+    assert len(read_svg(path)[1][0]) > len(before) + 5
 
 
 @pytest.mark.parametrize(

@@ -12,14 +12,17 @@ from pipelines.fit_evidence import PatternEvidence
 from pipelines.train_isp import TrainIsp, learn, store
 from recon.bodies import load_body
 from recon.cloth.energies import Cloth
-from recon.files.patterns import cut_pieces
+from recon.files.pattern_reading import read_svg
+from recon.files.patterns import cut_pieces, write_svg
 from recon.garments import patterns
 from recon.garments.dataset import Item, read_items, write_items
 from recon.garments.isp import load_isp
+from recon.garments.outlines import panel_loops, with_length, with_sleeves
 from recon.garments.patterns_body import Measures
 from recon.garments.patterns_place import BodyRelief
 from recon.garments.sewing import is_manifold, sewn_to
 from recon.metrics import boundary_loops, compare_meshes, panel_iou
+from recon.types import UserError
 
 PANELS = patterns.PANEL_NAMES["shirt6"]
 SMALL = {"width": 96, "pattern_depth": 2, "surface_depth": 3, "code": 4}
@@ -84,6 +87,24 @@ def test_the_pattern_has_six_pieces(items):
     assert all(len(p) == 1 for p in pieces)
     seams = [run for p in pieces for run in p[0].runs if run.label > 0]
     assert len(seams) == 2 * (len(patterns.SEAM_NAMES["shirt6"]) - 1)
+
+
+def test_the_pattern_comes_back_from_its_file_and_is_edited(items, tmp_path):
+    write_svg(items[1].garment, tmp_path / "six.svg")
+    panels, own = read_svg(tmp_path / "six.svg", PANELS), panel_loops(items[1].garment)
+    assert [len(loops) for loops in panels] == [1] * 6
+    for loops, truth in zip(panels, own, strict=True):
+        assert np.abs(loops[0].min(0) - truth[0].min(0)).max() < 1e-5 > np.abs(loops[0].max(0) - truth[0].max(0)).max()
+    text = (tmp_path / "six.svg").read_text()
+    (tmp_path / "five.svg").write_text(text.replace("cut-sleeve-back-left", "gone"))
+    with pytest.raises(UserError, match="no path called cut-sleeve-back-left...; wanted the outline of all 6 panels"):
+        read_svg(tmp_path / "five.svg", PANELS)
+    known = items[1].parameters
+    shorter = with_sleeves(with_length(panels, 0.8, "shirt6", known), 0.6, known)
+    for k, name in enumerate(PANELS):
+        part = 1 if name.startswith("sleeve") else 0  # sleeves get shorter along x, the trunk along y
+        change = np.ptp(panels[k][0], axis=0) - np.ptp(shorter[k][0], axis=0)
+        assert change[1 - part] > 0.05 and abs(change[part]) < 1e-9
 
 
 def test_a_learned_shirt_is_sewn_from_six_panels(decoder, items):
