@@ -1,6 +1,6 @@
 """recon scan on scans of known truth: outfits that no decoder saw on random bodies, with noise and holes.
 
-    python benchmarks/scans.py --cases 20              # to docs/results/scan.json and scan.md: minutes a case
+    python benchmarks/scans.py --cases 20              # to docs/results/scans.json and scans.md: minutes a case
     python benchmarks/scans.py --decoder udf --draper drapenet --weights out/weights --out out/scans-udf
     python benchmarks/scans.py --cases 8 --body        # the body stage alone; prints one JSON object a case
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import time
 from dataclasses import replace
@@ -99,7 +100,9 @@ def run_case(number: int, config: ScanFit, body_only: bool, kept: Path) -> dict:
 
 def page(rows: list[dict]) -> str:
     """The rows as Markdown."""
-    lines = ["# Scans of known truth", "", f"`python benchmarks/scans.py` on {platform.machine()}; distances in mm."]
+    load = f"load of the machine at the end {os.getloadavg()[0]:.1f} (above its cores seconds are too long)"
+    lines = ["# Scans of known truth", "", f"`python benchmarks/scans.py` on {platform.machine()}, {load};"]
+    lines += ["distances in mm.", ""]
     lines += (__doc__ or "").strip().splitlines()[4:]
     head = ("case", "pose", "garment", "code", "refined", "inside body", "self-crossings", "body", "body vertex", "s")
     lines += ["", f"| {' | '.join(head)} |"]
@@ -137,8 +140,8 @@ def main() -> None:
         rows.append(run_case(number, config, True, kept) if args.body else kept_case(number, config, kept))
         print(json.dumps(rows[-1]), flush=True)
         if not args.body:
-            write_whole(args.out / "scan.json", json.dumps(rows, indent=1) + "\n")
-            write_whole(args.out / "scan.md", page(rows))
+            write_whole(args.out / "scans.json", json.dumps(rows, indent=1) + "\n")
+            write_whole(args.out / "scans.md", page(rows))
 
 
 if __name__ == "__main__":

@@ -30,9 +30,13 @@ from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.atomic import write_whole
 from recon.files.meshes import Colour, write_glb, write_obj
+from recon.files.user_garments import read_garment_mesh
 from recon.files.weights import folder_with, read_manifest
 from recon.metrics import beneath_pct, inside_pct, largest_stretch
 from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
+
+OFF_BODY = 0.2
+"""A mesh further than this from the neutral body is not worn by it [m]."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +96,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
 
     at = time.perf_counter()
     body = load_body()
-    things = [load_garment(name, config.resolution, config.decoder, config.weights) for name in config.garments]
+    things, notes = _loaded(config, body)
     posed = body.pose(_worn_by(config, body))
     timed("load", at)
     at = time.perf_counter()
@@ -119,7 +123,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
     figures["garments"] = measure(names, things, layers, posed, body)
     for name, drawn in zip(names, how, strict=True):
         figures["garments"][name]["draper"] = drawn
-    figures["seconds"] = seconds
+    figures["seconds"], figures["notes"] = seconds, notes
     worn: dict[str, Garment | Mesh] = {}
     for name, thing, mesh in zip(names, things, layers, strict=True):
         worn[name] = replace(thing, mesh=mesh) if isinstance(thing, Garment) else mesh
@@ -137,6 +141,29 @@ def _check(config: Drape) -> None:
         raise UserError(f"--resolution: found {config.resolution}; wanted 16 to 1024")
     if config.out.exists() and not _is_ours(config.out):
         raise UserError(f"{config.out}: holds what is no drape's; wanted an empty folder (--out)")
+
+
+def _loaded(config: Drape, body: Body) -> tuple[list[Garment | Mesh], list[str]]:
+    """The garments, and what was done to users' meshes: those are repaired as ``recon encode`` does, and must be at
+    rest on the neutral body already."""
+    things: list[Garment | Mesh] = []
+    notes: list[str] = []
+    neutral = body.pose(body.neutral()).mesh.vertices[0].detach()
+    contact = BodyContact(neutral, body.faces)
+    for name in config.garments:
+        thing = load_garment(name, config.resolution, config.decoder, config.weights)
+        if isinstance(thing, Mesh):
+            repaired, told = read_garment_mesh(name)
+            thing = repaired if told else thing  # as it is: its vertices keep their order
+            notes += [f"{name}: {line}" for line in told]
+            away = float(contact.signed_distance(thing.vertices).abs().median())
+            if away > OFF_BODY:
+                raise UserError(
+                    f"{name}: lies {away:.2g} m from the neutral body (median); wanted a garment at rest on it, y up "
+                    "(recon encode writes it so, as placed.obj)"
+                )
+        things.append(thing)
+    return things, notes
 
 
 def _is_ours(folder: Path) -> bool:

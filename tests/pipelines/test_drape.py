@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from pipelines.cli import main
 from pipelines.drape import Drape, drape
@@ -46,12 +47,12 @@ def test_any_mesh_is_draped_and_untangled(tmp_path: Path, body) -> None:
     belt = ((corners[..., 1] > 0.85) & (corners[..., 1] < 1.1) & (corners[..., 0].abs() < 0.2)).all(1)
     used, faces = faces[belt].unique(return_inverse=True)
     out = torch.nn.functional.normalize(x[used] * torch.tensor([1.0, 0.0, 1.0]), dim=1)
-    write_obj(Mesh(x[used] + 0.02 * out, faces), tmp_path / "belt.obj")
+    write_obj(Mesh(1e3 * (x[used] + 0.02 * out), faces), tmp_path / "belt.obj")  # in millimetres
     settings = config(tmp_path / "o", garments=(str(tmp_path / "belt.obj"),), untangle=True, draper="")
     done = drape(settings, say=lambda line: None)
     found = done.figures["garments"]["belt"]
     assert found["draper"] == "skinning" and found["vertices_inside_body"] == 0
-    assert done.figures["untangle"]["clean"]
+    assert done.figures["untangle"]["clean"] and any("read as mm" in note for note in done.figures["notes"])
 
 
 def test_poses_by_name_file_and_frame(tmp_path: Path, body) -> None:
@@ -88,7 +89,17 @@ def test_mistakes_end_with_one_line(tmp_path: Path, capsys) -> None:
         (["skirt:3", "--pose", "yoga"], "--pose"),
         (["skirt:3", "--shape", *["0.1"] * 99], "99 coefficients"),
         (["skirt:3", "--shape", "nan"], "NaN"),
+        ([str(tmp_path / "gone.obj")], "no such file"),
+        ([str(tmp_path / "nan.obj")], "NaN"),
+        ([str(tmp_path / "empty.obj")], "without a triangle"),
+        ([str(tmp_path / "ball.obj")], "watertight"),
+        ([str(tmp_path / "away.obj")], "from the neutral body"),
     ]
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
+    ball = trimesh.creation.icosphere(1, 0.3)
+    ball.export(tmp_path / "ball.obj")
+    trimesh.Trimesh(ball.vertices + [0, -1.5, 0], ball.faces[10:]).export(tmp_path / "away.obj")
     for args, says in cases:
         where = [] if "--out" in args else ["--out", str(tmp_path / "new")]
         assert main(["drape", *args, *where, "--no-layering"]) == 2
