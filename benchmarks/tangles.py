@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -85,7 +87,7 @@ def displaced(wardrobe: Wardrobe, rng: np.random.Generator) -> list[Mesh]:
     fitting = [m.with_vertices(torch.from_numpy(x).float()) for m, x in zip(worn, done.vertices, strict=True)]
     fields = [smooth_noise(m.vertices, rng) for m in fitting]
     layers = fitting
-    for size in np.linspace(0.0, 0.03, 13)[1:]:
+    for size in np.geomspace(3e-4, 0.03, 24):
         moved = [m.with_vertices(m.vertices + size * noise) for m, noise in zip(fitting, fields, strict=True)]
         if tangled_share(moved) > MOST:
             break
@@ -106,30 +108,64 @@ def smooth_noise(x: torch.Tensor, rng: np.random.Generator, waves: int = 24) -> 
 FAMILIES = {"displaced": displaced, "unfitting": unfitting}
 
 
-def run_tangles(cases: int, seed: int = 0, family: str = "displaced") -> Iterator[dict]:
-    """Untangle ``cases`` random tangles of one of ``FAMILIES``; one row each."""
-    wardrobe, rng = Wardrobe.load(), np.random.default_rng(seed)
-    for number in range(cases):
-        layers = FAMILIES[family](wardrobe, rng)
-        share = tangled_share(layers)
-        begin = time.perf_counter()
-        done = untangle(layers, wardrobe.body)
-        seconds = time.perf_counter() - begin
-        moved = [
-            np.linalg.norm(x - m.vertices.double().numpy(), axis=1) for x, m in zip(done.vertices, layers, strict=True)
-        ]
-        pairs = len(layers) * (len(layers) - 1) / 2
-        yield {
-            "family": family,
-            "case": number,
-            "layers": len(layers),
-            "tangled_share": round(share, 4),
-            "pairs_before": done.crossings,
-            "pairs_left": len(done.left),
-            "inside": done.inside,
-            "rounds": done.rounds,
-            "seconds": round(seconds, 2),
-            "seconds_per_pair": round(seconds / pairs, 2),
-            "moved_mean_mm": round(float(np.concatenate(moved).mean()) * 1e3, 3),
-            "moved_max_mm": round(float(np.concatenate(moved).max()) * 1e3, 2),
-        }
+def run_tangles(cases: int, seed: int = 0, family: str = "displaced", kept: Path | None = None) -> Iterator[dict]:
+    """Untangle ``cases`` random tangles of one of ``FAMILIES``; one row each.
+
+    ``kept``: file of rows that were measured already, one a line; new ones are added.
+    """
+    done = [json.loads(line) for line in kept.read_text().splitlines()] if kept and kept.exists() else []
+    yield from done[:cases]
+    wardrobe = Wardrobe.load()
+    for number in range(len(done), cases):
+        row = {"family": family, "case": number}
+        row |= measured(FAMILIES[family](wardrobe, np.random.default_rng([seed, number])), wardrobe.body)
+        if kept:
+            with kept.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        yield row
+
+
+def measured(layers: list[Mesh], body: Mesh) -> dict:
+    """One tangle untangled: what was left, what it took, how far and how much longer cloth is."""
+    begin, busy = time.perf_counter(), time.process_time()
+    done = untangle(layers, body)
+    seconds, busy = time.perf_counter() - begin, time.process_time() - busy
+    before = np.concatenate([m.vertices.double().numpy() for m in layers])
+    moved = np.linalg.norm(np.concatenate(done.vertices) - before, axis=1)
+    pairs = len(layers) * (len(layers) - 1) / 2
+    return {
+        "layers": len(layers),
+        "tangled_share": round(tangled_share(layers), 4),
+        "pairs_before": done.crossings,
+        "pairs_left": len(done.left),
+        "inside": done.inside,
+        "judged_clean": judged_clean(done.vertices, layers),
+        "rounds": done.rounds,
+        "seconds": round(seconds, 2),
+        "seconds_per_pair": round(seconds / pairs, 2),
+        "cpu_seconds_per_pair": round(busy / pairs, 2),
+        "strain_pct": round(float(np.mean([edge_strain(m, x) for m, x in zip(layers, done.vertices)])), 3),
+        "moved_mean_mm": round(float(moved.mean()) * 1e3, 3),
+        "moved_max_mm": round(float(moved.max()) * 1e3, 2),
+        "notes": list(done.notes),
+    }
+
+
+def edge_strain(before: Mesh, after: np.ndarray) -> float:
+    """Mean change of the lengths of a mesh's edges [%]."""
+    f, x = before.faces.numpy(), before.vertices.double().numpy()
+    ends = np.unique(np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), 1), axis=0)
+    old, new = (np.linalg.norm(v[ends[:, 0]] - v[ends[:, 1]], axis=1) for v in (x, after))
+    return 100 * float(np.abs(new / old - 1).mean())
+
+
+def judged_clean(vertices: list[np.ndarray], layers: list[Mesh]) -> bool | None:
+    """What another library (ipctk) says; None where it is not installed."""
+    try:
+        import ipctk
+    except ImportError:
+        return None
+    starts = np.cumsum([0, *[len(x) for x in vertices]])
+    f = np.concatenate([m.faces.numpy() + at for m, at in zip(layers, starts)])
+    v = np.concatenate(vertices)
+    return not ipctk.has_intersections(ipctk.CollisionMesh(v, ipctk.edges(f), f), v)

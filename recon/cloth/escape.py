@@ -44,15 +44,20 @@ class Escape:
         lack[near[distance < 0]] = True
         return lack
 
-    def leave(self, x: NDArray, wanted: float, eager: float, times: int) -> NDArray[np.bool_]:
+    def leave(
+        self, x: NDArray, wanted: float, eager: float, times: int, beyond: NDArray | None = None
+    ) -> NDArray[np.bool_]:
         """Move ``x`` (V, 3), in place, until nothing is closer than ``wanted`` [m]; (V,) which vertices moved.
 
-        ``eager``: factor on the steps; ``times``: most of them.
+        ``eager``: factor on the steps; ``times``: most of them. What is inside goes further by ``beyond`` (V,) [m].
         """
         moved, n = np.zeros(len(x), bool), len(x)
+        further = None if beyond is None else np.concatenate([beyond, beyond[self.faces[:, 0]]])
         for _ in range(times):
             near, distance, normal = self._close(x, wanted)
             lack = np.maximum(wanted - distance, 0) * eager
+            if further is not None:
+                lack += np.where(distance < 0, further[near], 0.0)
             if not lack.any():
                 break
             astray = self._astray(x, near, distance, normal)[:, None]
@@ -105,9 +110,7 @@ class Escape:
 
 def outward_normals(x: NDArray, faces: NDArray, edges: NDArray) -> NDArray:
     """(V + F, 3) where outside is, at vertices and face centres, smoothed over folds."""
-    a, b, c = (x[faces[:, k]] for k in range(3))
-    normal = np.zeros_like(x)
-    np.add.at(normal, faces.ravel(), np.repeat(np.cross(b - a, c - a), 3, 0))
+    normal = area_normals(x, faces)
     i, j = np.concatenate([edges, edges[:, ::-1]]).T
     around = sp.coo_matrix((np.ones(len(i)), (i, j)), shape=(len(x), len(x))).tocsr()
     for _ in range(SMOOTHING):
@@ -115,6 +118,21 @@ def outward_normals(x: NDArray, faces: NDArray, edges: NDArray) -> NDArray:
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-15)
     middle = normal[faces].mean(1)
     return np.concatenate([normal, middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-15)])
+
+
+def vertex_normals(x: NDArray, faces: NDArray) -> NDArray:
+    """(V, 3) unit normals, weighted by area."""
+    normal = area_normals(x, faces)
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+
+
+def area_normals(x: NDArray, faces: NDArray) -> NDArray:
+    """(V, 3) sums of the normals of the faces at each vertex, as long as twice their areas [m2]."""
+    a, b, c = (x[faces[:, k]] for k in range(3))
+    cross, normal = np.cross(b - a, c - a), np.zeros_like(x)
+    for k in range(3):
+        np.add.at(normal, faces[:, k], cross)
+    return normal
 
 
 def scatter(x: NDArray, vertices: NDArray, moves: NDArray) -> None:

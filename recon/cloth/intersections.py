@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
@@ -40,13 +41,14 @@ def _through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
 def _find(
     mesh: wp.uint64,
     x: wp.array(dtype=wp.vec3d),
+    which: wp.array(dtype=int),
     edges: wp.array(dtype=wp.vec2i),
     faces: wp.array(dtype=wp.vec3i),
     pad: float,
     found: wp.array(dtype=wp.vec2i),
     count: wp.array(dtype=int),
 ):
-    i = wp.tid()
+    i = which[wp.tid()]
     e = edges[i]
     p = x[e[0]]
     q = x[e[1]]
@@ -74,16 +76,22 @@ class Crossings:
         self.edges, which = np.unique(ends, axis=0, return_inverse=True)
         self.faces_of_edge = faces_of_edges(which.reshape(-1), len(self.edges), len(faces))
         """(E, 2) the faces that meet at each edge, -1 where there is none; of more than two, the first and the last."""
+        self.rim = self.edges[self.faces_of_edge[:, 1] < 0]
+        """(R, 2) the edges of one face: open borders."""
         points = wp.zeros(vertices, dtype=wp.vec3, device=DEVICE)
         self.mesh = wp.Mesh(points, wp.array(self.faces.ravel(), dtype=int, device=DEVICE))
         self._x = wp.zeros(vertices, dtype=wp.vec3d, device=DEVICE)
         self._edges = wp.array(self.edges.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
         self._faces = wp.array(self.faces, dtype=wp.vec3i, device=DEVICE)
         self._found = wp.zeros(4096, dtype=wp.vec2i, device=DEVICE)
+        self._which = wp.array(np.arange(len(self.edges), dtype=np.int32), dtype=int, device=DEVICE)
         self._built = False
 
-    def __call__(self, x: NDArray) -> NDArray:
-        """(K, 2) rows of ``edges`` and of ``faces`` that pass through each other at ``x`` (V, 3), sorted."""
+    def __call__(self, x: NDArray, moved: NDArray | None = None) -> NDArray:
+        """(K, 2) rows of ``edges`` and of ``faces`` that pass through each other at ``x`` (V, 3), sorted.
+
+        ``moved`` (V,): what does not touch any of these vertices is known not to cross, and most of it is not asked.
+        """
         self._x.numpy()[:] = x
         self.mesh.points.numpy()[:] = x
         if self._built:
@@ -92,15 +100,34 @@ class Crossings:
             self.mesh = wp.Mesh(self.mesh.points, self.mesh.indices)
             self._built = True
         pad = float(GROW * max(np.abs(x).max(), 1.0)) if len(x) else 0.0
+        which = self._which if moved is None else self._near(x, moved)
         while True:
             count = wp.zeros(1, dtype=int, device=DEVICE)
-            inputs = [self.mesh.id, self._x, self._edges, self._faces, pad, self._found, count]
-            wp.launch(_find, len(self.edges), inputs=inputs, device=DEVICE)
+            inputs = [self.mesh.id, self._x, which, self._edges, self._faces, pad, self._found, count]
+            wp.launch(_find, len(which), inputs=inputs, device=DEVICE)
             total = int(count.numpy()[0])
             if total <= len(self._found):
                 found = self._found.numpy()[:total].astype(np.int64)
                 return found[np.lexsort((found[:, 1], found[:, 0]))]
             self._found = wp.zeros(2 * total, dtype=wp.vec2i, device=DEVICE)
+
+    def _near(self, x: NDArray, moved: NDArray) -> wp.array:
+        """Rows of the edges in cells of a grid beside those where faces with ``moved`` (V,) vertices are."""
+        touched = np.unique(self.faces[moved[self.faces].any(1)])
+        if not len(touched):
+            return wp.zeros(0, dtype=int, device=DEVICE)
+        ends = x[self.edges]
+        size = 1.01 * np.abs(ends[:, 0] - ends[:, 1]).max()  # no edge or face reaches beyond the next cell
+        low = x[touched].min(0) - 1.5 * size
+        cell = np.floor((x - low) / size).astype(np.int64)
+        count = cell[touched].max(0) + 2
+        grid = np.zeros(count, bool)
+        grid[tuple(cell[touched].T)] = True
+        grid = binary_dilation(grid, np.ones((3, 3, 3), bool))
+        close = ((cell >= 0) & (cell < count)).all(1)
+        close[close] = grid[tuple(cell[close].T)]
+        rows = np.flatnonzero(close[self.edges].any(1))
+        return wp.array(rows.astype(np.int32), dtype=int, device=DEVICE)
 
     def pairs(self, crossings: NDArray) -> NDArray:
         """(P, 2) pairs of faces that pass through each other, each once, sorted, of what a call returned."""

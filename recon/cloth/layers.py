@@ -15,6 +15,7 @@ from torch import Tensor
 from recon.cloth.constraints import Constraints, close_strangers, open_rim
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
+from recon.cloth.escape import vertex_normals
 from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, edge_laplacian, springs
 from recon.cloth.xpbd import ON_BORDER
 
@@ -117,7 +118,7 @@ class LayeredCloth:
     def _under(self, parts: list[NDArray], k: int, j: int) -> Contacts:
         """Vertices of layer k near layer j above it that face the same way: they stay inside of its faces."""
         found = self._over(parts, k, j)
-        own = _vertex_normals(parts[k], self.faces[k].numpy())[found.over[:, 0] - self.starts[k]]
+        own = vertex_normals(parts[k], self.faces[k].numpy())[found.over[:, 0] - self.starts[k]]
         same = (own * found.direction).sum(1) > SAME_WAY
         return Contacts(over=found.over[same], weights=found.weights[same], direction=-found.direction[same])
 
@@ -142,13 +143,3 @@ def _closest(surface: BodyContact, x: NDArray) -> tuple[NDArray, ...]:
     on = (surface.vertices.numpy()[corners] * weights[..., None]).sum(1)
     away = (x - on) * sign[:, None]
     return corners, weights, on, away, np.linalg.norm(away, axis=1)
-
-
-def _vertex_normals(x: NDArray, faces: NDArray) -> NDArray:
-    """(V, 3) unit normals, weighted by area."""
-    corners = x[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    out = np.zeros_like(x)
-    for k in range(3):
-        np.add.at(out, faces[:, k], normals)
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)

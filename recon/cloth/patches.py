@@ -1,4 +1,4 @@
-"""Pockets: cloth beyond a closed curve of intersection, laid flat across that curve.
+"""Cloth laid flat: pockets beyond a closed curve of intersection, or any part that is tangled.
 
 Where a pocket of cloth pokes through other cloth, its crossing edges cut it off from the rest of its mesh. Laid across
 the curve like a soap film it lies beside what it poked through, whatever its depth, and is never longer than before
@@ -15,6 +15,8 @@ from scipy.sparse.linalg import splu
 
 from recon.cloth.intersections import Crossings
 
+RIM_SMOOTHING = 20
+"""Times that open borders are averaged with their neighbours."""
 LARGEST = 0.15
 """Larger pieces of a layer's area are not pockets: then nobody knows which side is the right one."""
 
@@ -29,8 +31,7 @@ class Pockets:
         corners = x[faces]
         size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         self.area = np.bincount(faces.ravel(), np.repeat(size, 3), len(x))
-        rim = self.edges[crossings.faces_of_edge[:, 1] < 0]
-        self.loops = border_numbers(rim, len(x))
+        self.loops = border_numbers(crossings.rim, len(x))
 
     def find(self, crossing: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(V,) the vertices of all pockets; ``crossing`` (E,) whether an edge passes through a face."""
@@ -61,11 +62,25 @@ def border_numbers(rim: NDArray, vertices: int) -> NDArray:
     return loops
 
 
-def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_], gap: float = 0.0) -> NDArray:
-    """``x`` (V, 3) with the ``free`` vertices each in the middle of its neighbours, the others held.
+def film(x: NDArray, edges: NDArray, rim: NDArray, free: NDArray[np.bool_]) -> NDArray:
+    """``x`` (V, 3) with the ``free`` vertices laid like a soap film across the held ones.
 
-    What lay further off than ``gap`` goes on by as much [m]: two pockets that poked into each other end apart.
+    Open borders (``rim``, (R, 2) edges) would be drawn in: they are only smoothed, along themselves.
     """
+    out, on_rim = x.copy(), np.zeros(len(x), bool)
+    on_rim[rim] = True
+    ends = np.concatenate([rim, rim[:, ::-1]])
+    ends = ends[free[ends[:, 0]]]
+    chosen, which, count = np.unique(ends[:, 0], return_inverse=True, return_counts=True)
+    for _ in range(RIM_SMOOTHING if len(chosen) else 0):
+        middle = np.zeros((len(chosen), 3))
+        np.add.at(middle, which, out[ends[:, 1]])
+        out[chosen] += 0.5 * (middle / count[:, None] - out[chosen])
+    return laid_across(out, edges, free & ~on_rim)
+
+
+def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_]) -> NDArray:
+    """``x`` (V, 3) with the ``free`` vertices each in the middle of its neighbours, the others held."""
     touched = edges[free[edges].any(1)]
     if not len(touched):
         return x
@@ -78,7 +93,5 @@ def laid_across(x: NDArray, edges: NDArray, free: NDArray[np.bool_], gap: float 
     held = 1e-9 * x[free]
     np.add.at(held, number[a[~inside]], x[b[~inside]])
     out = x.copy()
-    flat = splu(sp.csc_matrix(matrix)).solve(held)
-    move = flat - x[free]
-    out[free] = flat + gap * move / np.maximum(np.linalg.norm(move, axis=1, keepdims=True), max(gap, 1e-12))
+    out[free] = splu(sp.csc_matrix(matrix)).solve(held)
     return out

@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from recon.cloth.intersections import self_intersections
+from recon.cloth.intersections import Crossings, self_intersections
 
 
 def triangles(*corners) -> tuple[np.ndarray, np.ndarray]:
@@ -99,3 +99,14 @@ def test_agrees_with_a_test_of_every_pair() -> None:
                     if p not in f[b] and q not in f[b] and segment_crosses(v[p], v[q], v[f[b]]):
                         all_pairs.add((i, j))
     assert {tuple(p) for p in self_intersections(v, f).tolist()} == all_pairs
+
+
+def test_what_moved_is_enough_to_ask() -> None:
+    v, f = grid(3, 0.02)
+    test = Crossings(f, len(v))
+    assert not len(test(v))
+    moved = np.zeros(len(v), bool)
+    moved[[40, 41, 53, 100]] = True
+    rough = v + moved[:, None] * np.array([2.5, 1.3, 0.05])
+    assert len(test(rough)) and np.array_equal(test(rough, moved), test(rough))
+    assert not len(test(rough, np.zeros(len(v), bool)))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from recon.cloth.intersections import Crossings
-from recon.cloth.patches import Pockets, border_numbers, laid_across
+from recon.cloth.patches import Pockets, border_numbers, film, laid_across
 
 
 def sheet(cells: int, height: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -55,6 +55,17 @@ def test_laid_cloth_lies_within_its_border() -> None:
     rough = x + free[:, None] * rng.normal(0, 0.1, x.shape)
     done = laid_across(rough, Crossings(faces, len(x)).edges, free)
     assert np.abs(done[:, 2]).max() < 1e-6
+
+
+def test_a_film_keeps_open_borders_where_they_are() -> None:
+    x, faces = sheet(10)
+    search = Crossings(faces, len(x))
+    free = x[:, 0] > 0.45
+    rough = x + np.column_stack([np.zeros((len(x), 2)), 0.1 * free * np.sin(20 * x[:, 1])])
+    done = film(rough, search.edges, search.rim, free)
+    np.testing.assert_array_equal(done[~free], rough[~free])
+    assert done[:, 0].max() > 0.95  # it is not drawn in
+    assert np.abs(done[free, 2]).max() < 0.5 * np.abs(rough[free, 2]).max()
 
 
 def test_nothing_free_nothing_moved() -> None:

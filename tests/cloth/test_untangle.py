@@ -88,6 +88,20 @@ def test_a_fold_through_itself_opens() -> None:
     assert edge_change(mesh, done.vertices[0]) < 0.03
 
 
+def test_a_deep_fin_goes_back_beneath_the_outer_layer_without_much_strain() -> None:
+    """An inner layer that sticks far out through a narrow outer one: sides alone don't say where to."""
+    outer, inner = cap(0.222), cap(0.21)
+    x = inner.vertices.numpy().copy()
+    near = np.exp(-((x[:, 1] - 0.02) ** 2 + x[:, 2] ** 2) / 0.002) * (x[:, 0] > 0)
+    x[:, 0] += 0.08 * near
+    meshes = [outer, inner.with_vertices(torch.as_tensor(x))]
+    assert crossing([outer.vertices.numpy(), x], meshes) > 20
+    loose, tight = (untangle(meshes, BODY, Untangling(tighten=rounds)) for rounds in (0, 6))
+    assert loose.clean and tight.clean and crossing(tight.vertices, meshes) == 0
+    strain = [sum(edge_change(m, x) for m, x in zip(meshes, done.vertices)) for done in (loose, tight)]
+    assert strain[1] < 0.8 * strain[0]
+
+
 def test_what_is_clean_stays_where_it_is() -> None:
     meshes = [cap(0.23), cap(0.21)]
     done = untangle(meshes, BODY)
