@@ -69,9 +69,11 @@ def page(found: dict) -> str:
     return f"""# Artist-made garments, encoded
 
 `python benchmarks/artists.py` on {found["machine"]}: `recon encode` with everything guessed
-(kind, unit, axis, place). The kind is right in {right} of {len(found["rows"])}. *Field*: mean distance of the mesh's
-points by the code's field, for unseen garments of the data set about 2.2 mm; *surface*: exact mean distance between the
-meshes. The decoders know loose clothes of two panels in T pose, and say what they hardly know.
+(kind, unit, axis, place). Here: {len(found["rows"])} of {len(KINDS)}, the kind right in {right}.
+
+*Field*: mean distance of the mesh's points by the code's field, for unseen garments of the data set about 2.2 mm;
+*surface*: exact mean distance between the meshes, both ways. The decoders know loose clothes of two panels in T pose,
+and say what they hardly know.
 
 {table}
 """

@@ -102,8 +102,9 @@ def page(rows: list[dict]) -> str:
     """The rows as Markdown."""
     load = f"load of the machine at the end {os.getloadavg()[0]:.1f} (above its cores seconds are too long)"
     lines = ["# Scans of known truth", "", f"`python benchmarks/scans.py` on {platform.machine()}, {load};"]
-    lines += ["distances in mm.", ""]
-    lines += (__doc__ or "").strip().splitlines()[4:]
+    lines += [f"distances in mm; {len(rows)} scans, the seconds on the clock.", ""]
+    told = (__doc__ or "").strip().splitlines()
+    lines += told[told.index("") :][5:]
     head = ("case", "pose", "garment", "code", "refined", "inside body", "self-crossings", "body", "body vertex", "s")
     lines += ["", f"| {' | '.join(head)} |"]
     lines += ["|---" * 10 + "|"]

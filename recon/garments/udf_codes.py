@@ -7,7 +7,7 @@ ends in rags. So learned codes are asked as well, and a prior keeps what descend
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from scipy.spatial import cKDTree
@@ -15,11 +15,12 @@ from torch import Tensor
 
 from recon.garments.latents import LatentPrior
 
-NEAR, FAR = 0.03, 0.12
+NEAR, FAR = 0.03, (0.12, 0.4)
 """Deviations of places beside the surface [m]: those that say where it ends, and those that say that there is no more
-of it elsewhere."""
+of it elsewhere: no sleeves on a vest."""
 
 
+@runtime_checkable
 class Fields(Protocol):
     """What a code is found with: ``UdfDecoder``, or another that has distance fields of codes."""
 
@@ -65,7 +66,8 @@ class Places:
         pick = points[torch.randint(len(points), (how.places,), generator=generator)]
         half = how.places // 2
         away = torch.full((half, 1), NEAR)
-        away[: round(how.far * half)] = FAR
+        for k, far in enumerate(FAR):
+            away[k : round(how.far * half) : len(FAR)] = far
         beside = pick[:half] + away * torch.randn(half, 3, generator=generator)
         wanted = torch.as_tensor(tree.query(beside.numpy())[0], dtype=pick.dtype).clamp(max=reach)
         return Places(pick, beside, wanted, reach)
@@ -78,7 +80,7 @@ class Places:
 def best_start(decoder: Fields, codes: Tensor, points: Tensor, reach: float) -> tuple[Tensor, float]:
     """The one of ``codes`` (n, z) whose field fits surface points (P, 3) [m] best, and its misfit."""
     generator = torch.Generator().manual_seed(1)
-    places = Places.draw(points, cKDTree(points.numpy()), reach, CodeSearch(places=300, far=0.3), generator)
+    places = Places.draw(points, cKDTree(points.numpy()), reach, CodeSearch(places=400, far=0.5), generator)
     with torch.no_grad():
         misfits = torch.stack([places.misfit(decoder.field(code)) for code in codes])
     best = int(misfits.argmin())

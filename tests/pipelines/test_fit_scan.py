@@ -10,7 +10,17 @@ import pytest
 import torch
 
 from pipelines.fit_body import to_body
-from pipelines.fit_scan_body import CloudLoss, ScanBodyFit, SurfaceLoss, evenly, fit_scan_body, search, thinned
+from pipelines.fit_scan_body import (
+    ARMS,
+    CloudLoss,
+    ScanBodyFit,
+    SurfaceLoss,
+    evenly,
+    fit_scan_body,
+    search,
+    thinned,
+    with_other_arms,
+)
 from pipelines.fit_scan_garment import TwoWay
 from pipelines.refine_scan import ScanRefinement, ToScan
 from recon.bodies import load_body
@@ -128,3 +138,17 @@ def test_energy_and_gradient_of_refinement_agree():
     slope = (energy([x + step])[0] - energy([x - step])[0]) / 2e-4
     assert (gradient * step / 1e-4).sum() == pytest.approx(slope, rel=0.03)
     assert slope < 0
+
+
+def test_other_arms_are_the_same_body_otherwise():
+    """Of those that join, each differs in one arm at least and in nothing but arms; the same call gives the same."""
+    values = {"shape": torch.randn(3, 4), "pose": 0.1 * torch.randn(3, 24, 3), "translation": torch.randn(3, 3)}
+    more = with_other_arms(values, 7)
+    assert all(len(v) == 10 and torch.equal(v[:3], values[k]) for k, v in more.items())
+    number = torch.arange(7) % 3
+    changed = (more["pose"][3:] != values["pose"][number]).any(2)
+    arms = torch.zeros(24, dtype=torch.bool)
+    arms[[joint for arm in ARMS for joint in arm]] = True
+    assert not changed[:, ~arms].any() and changed[:, arms].any(1).all()
+    assert torch.equal(more["shape"][3:], values["shape"][number])
+    assert torch.equal(with_other_arms(values, 7)["pose"], more["pose"])
