@@ -73,6 +73,16 @@ class Tighten:
                 break
         return x
 
+    def leave_body(self, x: NDArray, rounds: int) -> NDArray:
+        """(V, 3) ``x``, of which nothing crosses, as far out of the body as that stays so."""
+        for number in range(rounds):
+            if not self.body or not self.body.lack(x).any():
+                break
+            aim = x.copy()
+            everywhere = np.ones(len(x), bool)
+            x = self.filtered(x, self._apart(aim, everywhere, number) - x, False)
+        return x
+
     def _apart(self, aim: NDArray, free: NDArray, number: int) -> NDArray:
         """``aim`` (V, 3), moved in place to where less of it crosses and none of it is in the body."""
         self._leave(aim)
@@ -88,13 +98,16 @@ class Tighten:
         if self.body:
             self.body.leave(x, self.margin, 1.0, 2)
 
-    def filtered(self, x: NDArray, step: NDArray) -> NDArray:
-        """``x`` (V, 3) moved by as much of ``step`` (V, 3) as makes nothing cross; ``x`` itself must be clean."""
+    def filtered(self, x: NDArray, step: NDArray, outside: bool = True) -> NDArray:
+        """``x`` (V, 3) moved by as much of ``step`` (V, 3) as makes nothing cross; ``x`` itself must be clean.
+
+        ``outside``: nothing may enter the body either, and nothing of ``x`` is in it.
+        """
         share = np.ones(len(x))
         changed = np.abs(step).max(1) > 0
         for trial in range(TRIALS):
             after = x + share[:, None] * step
-            wrong = self._offenders(after, changed)
+            wrong = self._offenders(after, changed, outside)
             if not wrong.any():
                 return after
             if trial >= SPREAD:
@@ -104,13 +117,13 @@ class Tighten:
             changed = wrong
         return x.copy()
 
-    def _offenders(self, x: NDArray, changed: NDArray) -> NDArray[np.bool_]:
-        """(V,) vertices of what crosses, if it is ``changed`` (V,), or is in the body."""
+    def _offenders(self, x: NDArray, changed: NDArray, outside: bool) -> NDArray[np.bool_]:
+        """(V,) vertices of what crosses, if it is ``changed`` (V,); of what is in the body if that counts."""
         out = np.zeros(len(x), bool)
         found = self.crossings(x, changed)
         out[self.edges[found[:, 0]]] = True
         out[self.faces[found[:, 1]]] = True
-        if self.body:
+        if self.body and outside:
             lack = self.body.lack(x)
             out |= lack[: len(x)]
             out[self.faces[lack[len(x) :]]] = True

@@ -39,6 +39,8 @@ HELD = 0.1
 """How easily cloth gives way that is not laid flat, compared with what is."""
 RADIUS, WIDER, WIDEST = 0.04, 1.5, 0.2
 """Radius of the first balls whose cloth is laid flat, how many times wider the next are, and the widest [m]."""
+LEAVING = 20
+"""Most steps out of the body that cross nothing, where nothing does."""
 FARTHEST = 0.1
 """Where little else helps layers are recognised this deep in each other [m]."""
 
@@ -119,6 +121,7 @@ class _Tangle:
         self.pockets = Pockets(self.crossings, self.x, self.layer)
         self.flat = 0  # times that cloth was laid flat
         self.body = Escape(body, self.x, self.faces, self.edges) if body is not None else None
+        self.tighten = Tighten(self.repairs, self.body, settings.body, Tightening(rounds=settings.tighten))
 
     def solve(self) -> Untangled:
         """Rounds until nothing is left, then back to where cloth was as far as that stays so."""
@@ -128,8 +131,8 @@ class _Tangle:
         rounds = self._rounds(found, lack) if len(found) or lack.any() else 0
         found, lack = self.crossings(self.x), self._lack()
         if rounds and not len(found) and not lack.any():
-            how = Tightening(rounds=self.settings.tighten)
-            self.x = Tighten(self.repairs, self.body, self.settings.body, how)(self.x, goal, lengths)
+            self.x = self.tighten(self.x, goal, lengths)
+            found, lack = self.crossings(self.x), self._lack()
         left, inside = self.crossings.pairs(found), int(lack.sum())
         layers = [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
         return Untangled(layers, before, left, inside, rounds, self._notes(left, inside))
@@ -143,7 +146,10 @@ class _Tangle:
                 self._lay_flat(found)
                 found = self.crossings(self.x)
                 mark, stuck = len(found), 0
-            self._round(found, rounds)
+                if not len(found):
+                    self.x = self.tighten.leave_body(self.x, LEAVING)
+            if len(found) or self._lack().any():
+                self._round(found, rounds)
             found, lack = self.crossings(self.x), self._lack()
             now = int(lack.sum()), len(found)
             stuck = 0 if now[1] < 0.8 * mark else stuck + 1
