@@ -62,3 +62,11 @@ def skin(vertices: Tensor, transforms: Tensor, weights: Tensor) -> Tensor:
     differentiable in all three, once (no second derivatives).
     """
     return _Skin.apply(vertices.expand(len(transforms), -1, -1), transforms, weights)
+
+
+def shaped(rest: Tensor, directions: Tensor, shape: Tensor) -> Tensor:
+    """Rest vertices (V, 3), shape directions (V, 3, S), shapes (B, S) -> vertices at rest on those bodies (B, V, 3).
+
+    One product with columns side by side: several times faster than a sum over indices.
+    """
+    return rest + (directions.flatten(0, 1) @ shape.T).T.unflatten(1, (-1, 3))

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from recon.bodies.rig import JOINT_NAMES
-from recon.bodies.skin import skin
+from recon.bodies.skin import shaped, skin
 from recon.cloth.contact import BodyContact
 from recon.draping.isp import pose_features
 from recon.draping.skinning import SkinningDraper
@@ -103,7 +103,7 @@ class Displacements(nn.Module):
         """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]."""
         seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
         out = self.maps(torch.cat([seen, code.expand(len(x), -1)], 1))
-        return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1)
+        return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1).contiguous()
 
     def embedding(self, body: PosedBody) -> Tensor:
         """B: (B, N_B) of posed bodies."""
@@ -176,8 +176,7 @@ class Prepared:
 
     def place(self, moved: Tensor, body: PosedBody) -> Tensor:
         """(B, N, 3) displacements -> vertices in the world (Eq. 6)."""
-        shaped = self.rest + torch.einsum("nds,bs->bnd", self.directions, body.shape)
-        return skin(shaped + moved, body.transforms, self.weights)
+        return skin(shaped(self.rest, self.directions, body.shape) + moved, body.transforms, self.weights)
 
 
 Bound = tuple[Tensor, Tensor]

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from recon.bodies import Body
 from recon.bodies.rig import rotation_matrices
-from recon.bodies.skin import skin
+from recon.bodies.skin import shaped, skin
 from recon.cloth.energies import Cloth
 from recon.cloth.projective import Projecting, Projective
 from recon.draping.binding import METHODS, BodyField, cloth_operators
@@ -153,7 +153,7 @@ class Bound:
         """Bind template vertices (V, 3) by one of ``binding.METHODS``."""
         found = METHODS[method](BodyField.of(body), garment_vertices, faces)
         weights = found[:, :24] / found[:, :24].sum(1, keepdim=True)
-        return cls(garment_vertices, weights, found[:, 24:].unflatten(1, (3, -1)))
+        return cls(garment_vertices, weights, found[:, 24:].contiguous().unflatten(1, (3, -1)))
 
     def place(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
         """Displacements (B, V, 3), joint transforms (B, 24, 4, 4), shapes (B, S) -> posed vertices (B, V, 3)."""
@@ -161,7 +161,7 @@ class Bound:
 
     def shaped(self, shape: Tensor) -> Tensor:
         """The template as wide as bodies of shape (B, S): (B, V, 3) [m]."""
-        return self.rest + torch.einsum("vds,bs->bvd", self.directions, shape)
+        return shaped(self.rest, self.directions, shape)
 
 
 class GapsDraper:
@@ -189,17 +189,17 @@ class GapsDraper:
 
         Of the body only its skeleton is posed, unless projective steps need its skin.
         """
-        hidden, before, shape, shaped = None, None, None, None
+        hidden, before, shape, rest = None, None, None, None
         for pose in frames:
             rotations = rotation_matrices(pose.pose)
             features = features_of(rotations[None], pose.translation[None], fps, before)
             if shape is None or not torch.equal(pose.shape, shape):
-                shape, shaped = pose.shape, self.bound.shaped(pose.shape)
+                shape, rest = pose.shape, self.bound.shaped(pose.shape)
             if hidden is None:
                 hidden = self._warm(features, shape)
             moved, hidden = self.net(features, shape, hidden)
             before = rotations[:, 0], pose.translation
-            drape = skin(shaped + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
+            drape = skin(rest + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
             yield self.projective(drape, body.pose(pose)) if self.projective else drape
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:

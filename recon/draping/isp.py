@@ -8,11 +8,14 @@ by a decoder's code: so it drapes whatever has panels of its kind, and still doe
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import scipy.sparse as sp
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -20,7 +23,7 @@ from torch import Tensor, nn
 from recon.bodies.rig import PARENTS
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
-from recon.draping.uv import Box, Welding, around, compose, map_size, modes, rest_features
+from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, rest_features
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
 
@@ -75,7 +78,6 @@ class DisplacementNet(nn.Module):
 
     mean: Tensor
     components: Tensor
-    waves: Tensor
 
     def __init__(self, shape: DisplacementShape):
         super().__init__()
@@ -83,7 +85,7 @@ class DisplacementNet(nn.Module):
         rest = 8 * shape.cells[0] * shape.cells[1]
         self.register_buffer("mean", torch.zeros(rest))
         self.register_buffer("components", torch.zeros(rest, shape.code))
-        self.register_buffer("waves", modes(shape.box, shape.modes), persistent=False)
+        self.cosines = Cosines(shape.box, modes(shape.box, shape.modes))
         self.first = nn.Linear(shape.features, shape.width)
         self.inner = nn.ModuleList(nn.Linear(shape.width, shape.width) for _ in range(shape.depth - 1))
         self.again = nn.Linear(shape.features, shape.width, bias=False)
@@ -117,7 +119,7 @@ class DisplacementNet(nn.Module):
         for k, layer in enumerate(self.inner):
             h = h + F.silu(layer(h) + (self.again(x) if k == len(self.inner) // 2 else 0))
         found = self.shape.scale * self.out(self.narrow(h)).view(len(x), 2, self.shape.modes, 3)
-        return compose(self.shape.box, self.waves, found.permute(0, 3, 1, 2))
+        return self.cosines(found.permute(0, 3, 1, 2))
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,8 @@ class Worn:
     """(P, 4)."""
     welding: Welding
     code: Tensor
+    cells: tuple[int, int]
+    """Nodes of a map along x and y."""
 
     @classmethod
     def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:
@@ -147,10 +151,25 @@ class Worn:
             shares,
             Welding.of(garment),
             net.code(garment),
+            map_size(box),
         )
+
+    @cached_property
+    def sampling(self) -> sp.csr_matrix:
+        """(V, nodes) what reads maps at all vertices at once: several times faster than point by point."""
+        points, vertices = len(self.rows), len(self.bound.rest)
+        shares = self.shares.detach().cpu() * self.welding.share.cpu()[self.welding.vertex_of_point.cpu()]
+        at = self.welding.vertex_of_point.cpu()[:, None].expand(points, 4)
+        nodes = 2 * math.prod(self.cells)
+        entries = shares.flatten().float().numpy(), (at.flatten().numpy(), self.rows.cpu().flatten().numpy())
+        return sp.csr_matrix(entries, shape=(vertices, nodes))
 
     def displaced(self, maps: Tensor) -> Tensor:
         """Maps (B, 3, 2, nx, ny) -> displacements of the vertices at rest (B, V, 3) [m]."""
+        learned = torch.is_grad_enabled() and (maps.requires_grad or self.shares.requires_grad)
+        if not learned and not maps.is_cuda:
+            columns = maps.detach().flatten(2).flatten(0, 1).numpy().T
+            return torch.from_numpy(self.sampling @ columns).unflatten(1, (-1, 3)).transpose(0, 1)
         nodes = maps.flatten(2).flatten(0, 1).T.contiguous()
         at_points = (nodes[self.rows] * self.shares[..., None]).sum(1)
         return self.welding(at_points.unflatten(1, (-1, 3)).transpose(0, 1))

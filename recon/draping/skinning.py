@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from recon.bodies.skin import skin
+from recon.bodies.skin import shaped, skin
 from recon.draping.binding import JOINTS, METHODS, BodyField, settle
 from recon.draping.lattice import Lattice
 from recon.types import Garment, Mesh, PosedBody
@@ -41,7 +40,7 @@ class SkinningDraper:
         else:
             found = METHODS[self.method](self.field, vertices, faces)
         weights = found[:, :JOINTS] / found[:, :JOINTS].sum(1, keepdim=True)
-        return weights, found[:, JOINTS:].unflatten(1, (3, -1))
+        return weights, found[:, JOINTS:].contiguous().unflatten(1, (3, -1))
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
         """The garment on B bodies: Mesh with (B, N, 3) vertices; the layers beneath play no part in skinning.
@@ -53,8 +52,7 @@ class SkinningDraper:
     def drape_vertices(self, rest: Mesh, body: PosedBody) -> Tensor:
         """(N, 3) rest vertices on B bodies -> (B, N, 3)."""
         weights, directions = self.bind(rest.vertices, rest.faces)
-        shaped = rest.vertices + torch.einsum("nds,bs->bnd", directions, body.shape)
-        return skin(shaped, body.transforms, weights)
+        return skin(shaped(rest.vertices, directions, body.shape), body.transforms, weights)
 
 
 def load_skinning(body, folder: str | Path | None = None) -> SkinningDraper:

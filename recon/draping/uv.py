@@ -76,15 +76,28 @@ def map_size(box: Box) -> tuple[int, int]:
 
 def compose(box: Box, which: Tensor, coefficients: Tensor) -> Tensor:
     """Coefficients (..., M) of the cosines ``which`` (M, 2), at their levels -> maps (..., nx, ny) over a box."""
-    counts = [int(k) + 1 for k in which.amax(0)]
-    whole = coefficients.new_zeros(*coefficients.shape[:-1], counts[0] * counts[1])
-    at = (which[:, 0] * counts[1] + which[:, 1]).to(coefficients.device)
-    whole = whole.index_copy(-1, at, coefficients * levels(box, which).to(coefficients)).unflatten(-1, counts)
-    waves = [
-        torch.cos(math.pi * torch.linspace(0, 1, nodes)[:, None] * torch.arange(count)).to(coefficients)
-        for nodes, count in zip(map_size(box), counts, strict=True)
-    ]
-    return waves[0] @ whole @ waves[1].T
+    return Cosines(box, which)(coefficients)
+
+
+class Cosines:
+    """Sums of the cosines ``which`` (M, 2) over a box: what does not depend on their coefficients, made once."""
+
+    def __init__(self, box: Box, which: Tensor):
+        which = which.cpu()
+        self.counts = [int(k) + 1 for k in which.amax(0)]
+        self.at = which[:, 0] * self.counts[1] + which[:, 1]
+        self.levels = levels(box, which)
+        self.waves = [
+            torch.cos(math.pi * torch.linspace(0, 1, nodes)[:, None] * torch.arange(count))
+            for nodes, count in zip(map_size(box), self.counts, strict=True)
+        ]
+
+    def __call__(self, coefficients: Tensor) -> Tensor:
+        """Coefficients (..., M) -> maps (..., nx, ny)."""
+        whole = coefficients.new_zeros(*coefficients.shape[:-1], self.counts[0] * self.counts[1])
+        at, high = self.at.to(coefficients.device), self.levels.to(coefficients)
+        whole = whole.index_copy(-1, at, coefficients * high).unflatten(-1, self.counts)
+        return self.waves[0].to(coefficients) @ whole @ self.waves[1].to(coefficients).T
 
 
 def around(box: Box, cells: tuple[int, int], points: Tensor, panel: Tensor) -> tuple[Tensor, Tensor]:
