@@ -150,17 +150,34 @@ def crossing_pct(outer: Mesh, inner: Mesh) -> float:
     return 100 * float(area[hit].sum() / area.sum())
 
 
-def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Layering, say) -> tuple[dict, list[dict]]:
-    """One of the two tables, each way, and the rows of the garments alone."""
+def drapes_alone(size: Size, body: Body, draper: IspDraper, layering: Layering, dresses: int) -> list[dict]:
+    """The two inner garments of each table's outfits, and ``dresses`` more, alone on those outfits' bodies."""
+    rows = []
+    for kind in FIRST:
+        for group in range(size.groups):
+            seed = _seed(kind, group)
+            garments = [unseen_garments(k, 1, size.resolution, seed)[0] for k in (kind, "top")]
+            rows += alone(garments, body.pose(unseen_bodies(size.bodies, body, seed)), body, draper, layering)
+    for group in range(dresses):
+        posed = body.pose(unseen_bodies(size.bodies, body, 5000 + group))
+        rows += alone(unseen_garments("dress", 1, size.resolution, 5000 + group), posed, body, draper, layering)
+    return rows
+
+
+def _seed(kind: str, group: int) -> int:
+    return 100 * group + 7 * list(FIRST).index(kind)
+
+
+def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Layering, say) -> dict:
+    """One of the two tables, each way."""
     ways: dict[str, list[np.ndarray]] = {"without": [], "forces": [], "with": []}
-    rows, clean = [], []
+    clean: list[dict] = []
     for group in range(size.groups):
-        seed = 100 * group + 7 * list(FIRST).index(kind)
+        seed = _seed(kind, group)
         garments = unseen_garments(kind, 1, size.resolution, seed) + unseen_garments("top", TOPS, size.resolution, seed)
         with torch.no_grad():
             posed = body.pose(unseen_bodies(size.bodies, body, seed))
             drapes = [draper.drape(g, posed) for g in garments]
-            rows += alone(garments[:2], posed, body, draper, layering)
             outcomes = {
                 "without": drapes,
                 "forces": Layering(None)(garments, drapes, posed.mesh),
@@ -185,7 +202,7 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
     figures["cases"] = size.groups * size.bodies
     if clean:
         figures["untangled"] = {"cases": len(clean), "clean": sum(c["clean"] for c in clean), "each": clean}
-    return figures, rows
+    return figures
 
 
 def drawn_apart(layers: Sequence[Mesh], posed: PosedBody, body: Body) -> dict:
@@ -245,7 +262,9 @@ def summary(rows: list[dict]) -> dict:
     return out
 
 
-def measure(quick: bool, folder: Path | None = None, say=lambda line: None, outfits: int = 0) -> dict:
+def measure(
+    quick: bool, folder: Path | None = None, say=lambda line: None, outfits: int = 0, before: dict | None = None
+) -> dict:
     """All figures; ``layer_intersection_pct`` and ``drape_ms`` are those that the benchmark of ISP reports.
 
     Args:
@@ -253,20 +272,20 @@ def measure(quick: bool, folder: Path | None = None, say=lambda line: None, outf
         folder: with weights of your own; None = those that ship.
         say: hears about progress.
         outfits: so many of each table instead of the usual number; 0 = the usual.
+        before: an earlier result whose tables are kept; only garments alone and times are measured anew.
     """
     size = QUICK if quick else FULL
     size = replace(size, groups=outfits, tangled=min(size.tangled, outfits // 4)) if outfits else size
     body = load_body()
     draper, layering = load_isp_draper(body, folder), load_layering(folder)
     figures: dict = {"tables": {}, "pose_source": "held-out clip and random" if CLIP.is_file() else "random"}
-    rows: list[dict] = []
-    for kind, number in FIRST.items():
-        figures["tables"][number], found = layered(kind, size, body, draper, layering, say)
-        rows += found
-    if not quick:
-        for group in range(size.groups // 2):
-            posed = body.pose(unseen_bodies(size.bodies, body, 5000 + group))
-            rows += alone(unseen_garments("dress", 1, size.resolution, 5000 + group), posed, body, draper, layering)
+    if before is None:
+        for kind, number in FIRST.items():
+            figures["tables"][number] = layered(kind, size, body, draper, layering, say)
+    else:
+        figures = before
+    with torch.no_grad():
+        rows = drapes_alone(size, body, draper, layering, 0 if quick else size.groups // 2)
     figures["alone"] = summary(rows)
     figures["drape_ms"] = drape_ms(body, draper, layering, rounds=3 if quick else 15)
     tables = figures["tables"].values()
@@ -283,12 +302,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--weights", type=Path, default=None)
     parser.add_argument("--outfits", type=int, default=0, help="of each table, on four bodies each; 0 = 25")
+    parser.add_argument("--keep-tables", action="store_true", help="only garments alone, and times; tables as they are")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results" / "isp-layers.json")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     began = time.perf_counter()
-    figures = measure(options.quick, options.weights, lambda line: print(line, flush=True), options.outfits)
+    before = json.loads(options.out.read_text()) if options.keep_tables else None
+    figures = measure(options.quick, options.weights, lambda line: print(line, flush=True), options.outfits, before)
     figures |= {
         "seconds": round(time.perf_counter() - began, 1),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {options.threads} threads",

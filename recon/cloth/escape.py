@@ -37,8 +37,13 @@ class Escape:
         self.asked: NDArray | None = None
         self.known = np.zeros(0)
 
-    def lack(self, x: NDArray) -> NDArray[np.bool_]:
-        """(V + F,) which vertices and face centres of ``x`` (V, 3) are inside."""
+    def lack(self, x: NDArray, fresh: bool = False) -> NDArray[np.bool_]:
+        """(V + F,) which vertices and face centres of ``x`` (V, 3) are inside.
+
+        ``fresh``: ask all, whatever is known: where a body overlaps itself sides change without its surface being met.
+        """
+        if fresh:
+            self.asked = None
         lack = np.zeros(len(x) + len(self.faces), bool)
         near, distance, _ = self._close(x, 0.0)
         lack[near[distance < 0]] = True

@@ -129,10 +129,12 @@ class _Tangle:
         before = len(self.crossings.pairs(found))
         goal, lengths = self.x.copy(), self.lengths.copy()
         rounds = self._rounds(found, lack) if len(found) or lack.any() else 0
-        found, lack = self.crossings(self.x), self._lack()
+        found, lack = self.crossings(self.x), self._lack(fresh=True)
         if rounds and not len(found) and not lack.any():
-            self.x = self.tighten(self.x, goal, lengths)
-            found, lack = self.crossings(self.x), self._lack()
+            clean, self.x = self.x, self.tighten(self.x, goal, lengths)
+            if self._lack(fresh=True).any():
+                self.x = clean
+            found, lack = self.crossings(self.x), self._lack(fresh=True)
         left, inside = self.crossings.pairs(found), int(lack.sum())
         layers = [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
         return Untangled(layers, before, left, inside, rounds, self._notes(left, inside))
@@ -151,6 +153,8 @@ class _Tangle:
             if len(found) or self._lack().any():
                 self._round(found, rounds)
             found, lack = self.crossings(self.x), self._lack()
+            if not len(found) and not lack.any():
+                lack = self._lack(fresh=True)
             now = int(lack.sum()), len(found)
             stuck = 0 if now[1] < 0.8 * mark else stuck + 1
             mark, rounds = min(mark, now[1]), rounds + 1
@@ -202,9 +206,9 @@ class _Tangle:
             lines.append(f"{inside} vertices and face centres are still inside the body")
         return tuple(lines)
 
-    def _lack(self) -> NDArray:
-        """(V + F,) whether vertices and face centres are inside the body."""
-        return self.body.lack(self.x) if self.body else np.zeros(len(self.x) + len(self.faces), bool)
+    def _lack(self, fresh: bool = False) -> NDArray:
+        """(V + F,) whether vertices and face centres are inside the body; ``fresh`` as in ``Escape.lack``."""
+        return self.body.lack(self.x, fresh) if self.body else np.zeros(len(self.x) + len(self.faces), bool)
 
     def _leave_body(self, number: int, times: int, beyond: NDArray | None = None) -> NDArray:
         """Vertices and face centres closer to the body than the margin go out; returns which vertices moved."""
