@@ -227,9 +227,9 @@ def drape_ms(
         for _ in range(rounds):
             draper._kept.clear()
             runs = {
-                "_steps": lambda g=garment, s=stepping: s.drape(g, posed),
                 "_prepare": lambda g=garment: draper.prepare(g),
                 "": lambda g=garment: draper.drape(g, posed),
+                "_steps": lambda g=garment, s=stepping: s.drape(g, posed),
                 "_layer": lambda r=raster, m=mesh, s=skin: layering.over(r, m, s),
             }
             for part, run in runs.items():

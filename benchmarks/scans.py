@@ -5,7 +5,7 @@
     python benchmarks/scans.py --cases 8 --body        # the body stage alone; prints one JSON object a case
 
 Poses take turns: A, T, standing, and random within the joints' limits; the person faces anywhere. Distances in mm:
-``code`` and ``refined`` are the truth's vertices to the fitted surface (medians; the code's as skinned, before
+``code`` and ``refined`` are vertices of truth and fit to the other's surface (medians; the code's as skinned, before
 refinement), ``body`` the true body's skin to the fitted one's, ``body_vertex`` between the same vertices.
 
 Interrupted, the same command goes on: finished cases are kept under out/benchmarks/scans, and so are the finished
@@ -68,7 +68,10 @@ def kept_case(number: int, config: ScanFit, kept: Path) -> dict:
 
 def folder_of(config: ScanFit) -> Path:
     """Where the cases of these settings are kept."""
-    key = digest(canonical(replace(config, out=Path())), canonical(read_manifest(config.weights)), recon.__version__)
+    drapers = {"isp": "drape-isp-", "drapenet": "drapenet"}
+    uses = tuple({f"{config.decoder}-", drapers.get(config.draper, f"{config.decoder}-")})
+    used = {name: card for name, card in read_manifest(config.weights).items() if name.startswith(uses)}
+    key = digest(canonical(replace(config, out=Path())), canonical(used), recon.__version__)
     return ROOT / "out" / "benchmarks" / "scans" / key[:12]
 
 
@@ -91,11 +94,16 @@ def run_case(number: int, config: ScanFit, body_only: bool, kept: Path) -> dict:
         for layer in layers:
             truth, coded = made.garments[layer.name], by_code(layer, posed, models)
             row["garments"][layer.name] = {
-                "code": float(to_truth(truth, coded).median()),
-                "refined": float(to_truth(truth, meshes[layer.name]).median()),
+                "code": both_ways(truth, coded),
+                "refined": both_ways(truth, meshes[layer.name]),
                 **geometry(layer, meshes[layer.name], contact),
             }
     return row
+
+
+def both_ways(truth: Mesh, found: Mesh) -> float:
+    """Median distance of either's vertices to the other's surface [mm]."""
+    return float(torch.cat([to_truth(truth, found), to_truth(found, truth)]).median())
 
 
 def page(rows: list[dict]) -> str:

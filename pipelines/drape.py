@@ -26,7 +26,7 @@ from recon.cloth.untangle import Untangled, untangle
 from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.isp import IspDraper
 from recon.draping.layering import Beneath, Layering, load_layering
-from recon.draping.projected import ProjectedDraper
+from recon.draping.projected import ANY_POSE, ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.atomic import write_whole
 from recon.files.meshes import Colour, write_glb, write_obj
@@ -211,7 +211,7 @@ def drape_each(
     how: list[str] = []
     drapes: list[Mesh] = []
     folder = folder_with("drape", config.weights)
-    skinning, projecting = SkinningDraper(body), Projecting(steps=config.steps)
+    skinning, projecting = SkinningDraper(body), replace(ANY_POSE, steps=config.steps)
     isp = load_draper("isp", body, folder) if config.draper in ("", "isp") else None
     for name, thing in zip(config.garments, things, strict=True):
         chosen = config.draper

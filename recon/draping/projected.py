@@ -17,13 +17,17 @@ from recon.draping.dress import held_vertices
 from recon.draping.skinning import SkinningDraper
 from recon.types import Garment, Mesh, PosedBody
 
+ANY_POSE = Projecting(anchor=60.0, shallow=0.01)
+"""For bodies of any shape in any pose, whose parts lie in each other more than those of a recorded motion: there, cloth
+that is drawn out of a part that it does not ride on is mostly stretched."""
+
 
 class ProjectedDraper:
     """A ``Draper``: another one, and projective steps after it."""
 
     def __init__(self, draper: Draper, skinning: SkinningDraper, settings: Projecting | None = None):
         """``skinning`` says which part of the body each vertex rides on."""
-        self.draper, self.skinning, self.settings = draper, skinning, settings
+        self.draper, self.skinning, self.settings = draper, skinning, settings or ANY_POSE
         self._last: tuple[Tensor, Projective] | None = None
 
     def prepared(self, garment: Garment) -> Projective:
