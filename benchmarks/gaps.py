@@ -272,7 +272,7 @@ def table(title: str, rows: dict[str, dict], untangled: bool) -> list[str]:
         "|---|---|" + "---|" * len(heads),
     ]
     for name, row in rows.items():
-        cells = [name, str(row["card"]["steps"]), *(_errors(row[way]) for way in WAYS)]
+        cells = [name, str(row["card"]["steps"]), *(_errors(row.get(way)) for way in WAYS)]
         if untangled:
             u = row["untangled"]
             cells.append(f"{_errors(u)}; {u['clean_frames']} of {u['frames']}")
@@ -280,7 +280,9 @@ def table(title: str, rows: dict[str, dict], untangled: bool) -> list[str]:
     return lines
 
 
-def _errors(figures: dict) -> str:
+def _errors(figures: dict | None) -> str:
+    if figures is None:  # measured before there were steps
+        return "-"
     return f"{figures['eps_e']:.2f}, {figures['eps_a']:.2f}, {figures['eps_c']:.2f} ± {figures['eps_c_std']:.2f}"
 
 
@@ -305,7 +307,7 @@ def page(found: dict) -> str:
     ]
     for title, rows in found["table3"].items():
         for name, row in rows.items():
-            lines.append(f"| {title} | {name} | {' | '.join(_errors(row[way]) for way in WAYS)} |")
+            lines.append(f"| {title} | {name} | {' | '.join(_errors(row.get(way)) for way in WAYS)} |")
     t, s = found["table4_ms"], found["solver"]
     lines += ["", "## Table 4: time", ""]
     lines += [

@@ -39,7 +39,7 @@ from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
 
 DRAPERS = ("gaps", "simulate", "skinning")
 WRITERS = ("glb", "obj", "pc2", "gif", "mp4")
-ROUNDS = 40
+ROUNDS = 16
 """Most rounds of untangling per frame: what has no room in one frame mostly has none in the next."""
 CHUNK = 20
 """Frames that are untangled between two times that this is kept."""

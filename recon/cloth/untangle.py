@@ -140,8 +140,9 @@ class _Tangle:
         return Untangled(layers, before, left, inside, rounds, self._notes(left, inside))
 
     def _rounds(self, found: NDArray, lack: NDArray) -> int:
-        """How many it took; ends clean, or with the best that was found."""
+        """How many it took; ends clean, or with the best before cloth was laid flat: films stretch, and in vain."""
         best, best_x, rounds = (int(lack.sum()), len(found)), self.x.copy(), 0
+        gentle, gentle_x = best, best_x
         mark, stuck = best[1], 0
         while any(best) and rounds < self.settings.rounds:
             if stuck >= PATIENCE:
@@ -160,7 +161,9 @@ class _Tangle:
             mark, rounds = min(mark, now[1]), rounds + 1
             if now < best:
                 best, best_x = now, self.x.copy()
-        self.x = best_x
+            if not self.flat and now < gentle:
+                gentle, gentle_x = now, best_x
+        self.x = gentle_x if any(best) else best_x
         return rounds
 
     def _round(self, found: NDArray, number: int) -> None:
