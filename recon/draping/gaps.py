@@ -24,6 +24,7 @@ from recon.cloth.energies import Cloth
 from recon.cloth.projective import Projecting, Projective
 from recon.draping.binding import METHODS, BodyField, cloth_operators
 from recon.draping.dress import held_vertices
+from recon.draping.frame import FrameRig
 from recon.files.weights import read_weights
 from recon.types import TWO_PANELS, BodyPose, Garment, Mesh, PosedBody, UserError
 
@@ -49,6 +50,8 @@ class GapsShape:
     layers: int = 4
     scale: float = 0.05
     """Displacement [m] that an output of one means."""
+    rank: int = 0
+    """Drapes that the last layer mixes; 0 = displacements straight from the states."""
 
 
 class GapsNet(nn.Module):
@@ -62,7 +65,8 @@ class GapsNet(nn.Module):
         self.shape = shape
         self.register_buffer("basis", basis, persistent=False)
         self.gru = nn.GRU(FEATURES + shape.n_shape, shape.width, shape.layers, batch_first=True)
-        self.out = nn.Linear(shape.width, 3 * (shape.vertices if basis is None else basis.shape[1]))
+        self.few = nn.Linear(shape.width, shape.rank, bias=False) if shape.rank else nn.Identity()
+        self.out = nn.Linear(shape.rank or shape.width, 3 * (shape.vertices if basis is None else basis.shape[1]))
         nn.init.normal_(self.out.weight, 0.0, 0.01)
         nn.init.zeros_(self.out.bias)
 
@@ -74,7 +78,7 @@ class GapsNet(nn.Module):
     def forward(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As ``remember`` -> displacements (B, T, V, 3) [m], hidden."""
         states, hidden = self.remember(features, shape, hidden)
-        moved = self.out(states).unflatten(-1, (-1, 3))
+        moved = self.out(self.few(states)).unflatten(-1, (-1, 3))
         return self.shape.scale * (moved if self.basis is None else self.basis @ moved), hidden
 
     def folded(self) -> GapsNet:
@@ -83,6 +87,7 @@ class GapsNet(nn.Module):
             return self
         net = GapsNet(self.shape)
         net.gru.load_state_dict(self.gru.state_dict())
+        net.few.load_state_dict(self.few.state_dict())
         with torch.no_grad():
             weight = torch.einsum("vm,mdw->vdw", self.basis, self.out.weight.unflatten(0, (-1, 3)))
             net.out.weight.copy_(weight.flatten(0, 1))
@@ -189,17 +194,17 @@ class GapsDraper:
 
         Of the body only its skeleton is posed, unless projective steps need its skin.
         """
-        hidden, before, shape, rest = None, None, None, None
+        rig: FrameRig | None = None
+        hidden, shape, rest = None, torch.empty(0), torch.empty(0)
         for pose in frames:
-            rotations = rotation_matrices(pose.pose)
-            features = features_of(rotations[None], pose.translation[None], fps, before)
-            if shape is None or not torch.equal(pose.shape, shape):
+            if rig is None or not torch.equal(pose.shape, shape):
                 shape, rest = pose.shape, self.bound.shaped(pose.shape)
+                rig = FrameRig(body.rest_joints(shape)[0], body.parents, SPEED, rig)
+            features = rig(pose.pose[0], pose.translation[0], fps).to(rest)[None, None]
             if hidden is None:
                 hidden = self._warm(features, shape)
             moved, hidden = self.net(features, shape, hidden)
-            before = rotations[:, 0], pose.translation
-            drape = skin(rest + moved[0], body.skeleton(pose, rotations)[0], self.bound.weights)
+            drape = skin(rest + moved[0], rig.transforms.to(rest), self.bound.weights)
             yield self.projective(drape, body.pose(pose)) if self.projective else drape
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
