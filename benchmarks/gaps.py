@@ -26,6 +26,7 @@ from draping import tube
 
 from pipelines.sequence import led_in, measure, untangled
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import clear_motion
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
@@ -176,6 +177,11 @@ def gaps_names(folder: Path | None, wanted: list[str] | None) -> list[str]:
     return wanted or [n.removeprefix("gaps-") for n in read_manifest(folder) if n.startswith("gaps-")]
 
 
+def unseen_motion(body: Body) -> Motion:
+    """The clip that no network learned from, limbs clear of the neutral body."""
+    return clear_motion(motion_of(read_clip(CLIP), body, 30.0), body, body.neutral().shape)
+
+
 def quick(folder: Path | None) -> dict:
     """A minute's worth: few frames, few tangles, a coarse square."""
     from tangles import run_tangles
@@ -183,7 +189,7 @@ def quick(folder: Path | None) -> dict:
     body = load_body()
     row: dict = {f"eps_{key}_pct{way}": {} for way in ("", "_steps") for key in ("c", "e", "a")}
     if CLIP.exists():
-        motion = motion_of(read_clip(CLIP), body, 30.0)
+        motion = unseen_motion(body)
         for name in gaps_names(folder, None):
             found = table1(name, folder, body, motion, 20, draw_apart=False)
             for way, title in (("network", ""), ("projected", "_steps")):
@@ -359,9 +365,9 @@ def measure_part(part: str, options: argparse.Namespace) -> dict | None:
     if part == "baselines":
         if options.baselines is None:
             return None
-        motion = motion_of(read_clip(CLIP), body, 30.0)
+        motion = unseen_motion(body)
         return networks(options.baselines, gaps_names(options.baselines, None), body, motion, 0)
-    names, motion = gaps_names(options.weights, options.names), motion_of(read_clip(CLIP), body, 30.0)
+    names, motion = gaps_names(options.weights, options.names), unseen_motion(body)
     if part == "table3":
         return other_bodies(options.weights, names, body, motion)
     return networks(options.weights, names, body, motion, options.every)

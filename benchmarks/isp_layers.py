@@ -30,6 +30,7 @@ import torch
 
 from pipelines.drape_garments import between
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import clear_bodies
 from recon.bodies.pose_prior import sample_poses
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
@@ -72,7 +73,7 @@ FULL, QUICK = Size(25, 4, 80, 8), Size(1, 2, 48, 0)
 
 
 def unseen_bodies(count: int, body: Body, seed: int) -> BodyPose:
-    """Bodies of the population, half of them in poses of the held-out clip, where it is at hand."""
+    """Bodies of the population, half of them in poses of the held-out clip, where it is at hand; limbs cleared."""
     generator = torch.Generator().manual_seed(UNSEEN + seed)
     pose = sample_poses(count, generator)
     if CLIP.is_file():
@@ -80,7 +81,7 @@ def unseen_bodies(count: int, body: Body, seed: int) -> BodyPose:
         half = count // 2
         pose[:half] = frames[torch.randint(len(frames), (half,), generator=generator)]
     shape = torch.randn(count, body.n_shape, generator=generator).clamp(-2, 2)
-    return BodyPose(shape, pose, torch.zeros(count, 3))
+    return clear_bodies(BodyPose(shape, pose, torch.zeros(count, 3)), body)
 
 
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:

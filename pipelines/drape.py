@@ -18,6 +18,7 @@ from pipelines.garment_source import load_garment
 from pipelines.palette import SKIN, layer_colour
 from pipelines.pose_source import load_pose
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import Clearing, clear_motion
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import self_intersections
@@ -33,7 +34,7 @@ from recon.files.meshes import Colour, write_glb, write_obj
 from recon.files.user_garments import read_garment_mesh
 from recon.files.weights import folder_with, read_manifest
 from recon.metrics import beneath_pct, inside_pct, largest_stretch
-from recon.types import BodyPose, Garment, Mesh, PosedBody, UserError
+from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
 
 OFF_BODY = 0.2
 """A mesh further than this from the neutral body is not worn by it [m]."""
@@ -50,6 +51,9 @@ class Drape:
     """t, a (arms lowered), stand, random:SEED, or a motion file (npz or bvh), of which FILE:FRAME takes a frame."""
     shape: tuple[float, ...] = ()
     """First coefficients of the body's shape, in deviations of the population; the rest are 0."""
+    room: float = Clearing.gap
+    """Room between parts of the body [m]: limbs that pass through it are turned, as little as gives cloth room;
+    0 = the pose as it is."""
     out: Path = Path("out/drape")
     """Folder for the results."""
     draper: str = ""
@@ -97,7 +101,8 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
     at = time.perf_counter()
     body = load_body()
     things, notes = _loaded(config, body)
-    posed = body.pose(_worn_by(config, body))
+    worn_by, more = _worn_by(config, body)
+    posed, notes = body.pose(worn_by), notes + more
     timed("load", at)
     at = time.perf_counter()
     how, drapes = drape_each(things, posed, body, config)
@@ -137,6 +142,8 @@ def _check(config: Drape) -> None:
         raise UserError(f"--draper: found {config.draper!r}; wanted one of {', '.join(DRAPERS)}")
     if config.steps < 0:
         raise UserError(f"--steps: found {config.steps}; wanted 0 or more")
+    if config.room < 0:
+        raise UserError(f"--room: found {config.room}; wanted metres, 0 or more")
     if not 16 <= config.resolution <= 1024:
         raise UserError(f"--resolution: found {config.resolution}; wanted 16 to 1024")
     if config.out.exists() and not _is_ours(config.out):
@@ -187,8 +194,9 @@ def _names(garments: Sequence[str]) -> list[str]:
     return names
 
 
-def _worn_by(config: Drape, body: Body) -> BodyPose:
-    """One body of the wanted shape and pose."""
+def _worn_by(config: Drape, body: Body) -> tuple[BodyPose, list[str]]:
+    """One body of the wanted shape and pose, and what was done to it."""
+    notes: tuple[str, ...] = ()
     if len(config.shape) > body.n_shape:
         raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
     shape = torch.zeros(1, body.n_shape)
@@ -196,10 +204,13 @@ def _worn_by(config: Drape, body: Body) -> BodyPose:
     if not shape.isfinite().all():
         raise UserError("--shape: found NaN or infinity; wanted numbers")
     pose, place = load_pose(config.pose, body)
+    if config.room:
+        motion = clear_motion(Motion(pose, torch.zeros(1, 3), 30.0), body, shape, Clearing(gap=config.room))
+        pose, notes = motion.pose, motion.notes
     if place is None:  # on the floor
         place = torch.zeros(1, 3)
         place[0, 1] = -body.pose(BodyPose(shape, pose, place)).mesh.vertices[0, :, 1].min()
-    return BodyPose(shape, pose, place)
+    return BodyPose(shape, pose, place), list(notes)
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from recon.bodies import Body
+from recon.bodies.clearance import Clearance, clear_motion
 from recon.bodies.pose_prior import sample_poses
 from recon.bodies.retarget import mirrored, motion_of
 from recon.bodies.rig import JOINT_NAMES
@@ -29,6 +30,8 @@ CLIP_TERMS = "Apache-2.0; learned from motion clips, whose terms hold: of the sh
 def read_motions(folder: Path, holdout: Collection[str], body: Body, fps: float) -> list[Motion]:
     """The clips of a folder (npz or bvh) at ``fps``, each followed by its mirror image further down the list.
 
+    Limbs are clear of the neutral body: where they pass through it no cloth can lie.
+
     Raises:
         UserError: there are none that are not held out, or one can't be read.
     """
@@ -36,7 +39,8 @@ def read_motions(folder: Path, holdout: Collection[str], body: Body, fps: float)
     files = [p for p in files if p.stem not in holdout]
     if not files:
         raise UserError(f"{folder}: found no motion clips (npz or bvh) to learn from")
-    motions = [motion_of(read_clip(p), body, fps) for p in files]
+    shape = body.neutral().shape
+    motions = [clear_motion(motion_of(read_clip(p), body, fps), body, shape) for p in files]
     return motions + [_mirror(m) for m in motions]
 
 
@@ -59,24 +63,46 @@ class Sampling:
     """Share of all poses that are led back towards the T pose by a random factor."""
     shape_spread: float = 1.0
     """Standard deviation of the shape coefficients, cut at two: one is the population's."""
+    pool: int = 400
+    """Poses that are drawn and cleared once, to choose from: clearing takes some 30 ms each."""
 
 
 class BodySampler:
     """Random bodies to drape on, repeatable from a generator."""
 
-    def __init__(self, motions: Sequence[Motion], n_shape: int, settings: Sampling | None = None):
+    def __init__(
+        self,
+        motions: Sequence[Motion],
+        n_shape: int,
+        settings: Sampling | None = None,
+        clearance: Clearance | None = None,
+    ):
         """
         Args:
             motions: where clip poses come from; none: all poses are random.
             n_shape: number of shape coefficients.
             settings: see :class:`Sampling`.
+            clearance: turns limbs out of the body, in a pool of poses drawn once; None: poses as they are.
         """
         self.settings = settings or Sampling()
         self.n_shape = n_shape
         self.frames = torch.cat([m.pose for m in motions]) if motions else torch.zeros(0, 24, 3)
+        self.pool: Tensor | None = None
+        if clearance is not None:
+            drawn = self._poses(self.settings.pool, torch.Generator().manual_seed(0))
+            self.pool = torch.cat([clearance.cleared(some) for some in drawn.split(100)])
 
     def __call__(self, count: int, generator: torch.Generator) -> BodyPose:
         """``count`` bodies; pelvis turned as in the clips, standing at the origin."""
+        if self.pool is None:
+            pose = self._poses(count, generator)
+        else:
+            pose = self.pool[torch.randint(len(self.pool), (count,), generator=generator)]
+        shape = torch.randn(count, self.n_shape, generator=generator).clamp(-2, 2) * self.settings.shape_spread
+        return BodyPose(shape, pose, torch.zeros(count, 3))
+
+    def _poses(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, 24, 3) drawn anew."""
         s = self.settings
 
         def chosen(share: float) -> Tensor:
@@ -88,6 +114,4 @@ class BodySampler:
             clip = torch.where(chosen(s.swap) & ARMS[:, None], arms, legs)
             pose = torch.where(chosen(s.clips), clip, pose)
         factor = torch.where(chosen(s.calm), torch.rand(count, 1, 1, generator=generator), torch.ones(count, 1, 1))
-        pose = torch.cat([pose[:, :1], pose[:, 1:] * factor], 1)
-        shape = torch.randn(count, self.n_shape, generator=generator).clamp(-2, 2) * s.shape_spread
-        return BodyPose(shape, pose, torch.zeros(count, 3))
+        return torch.cat([pose[:, :1], pose[:, 1:] * factor], 1)

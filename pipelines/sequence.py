@@ -21,6 +21,7 @@ from pipelines.garment_source import load_garment
 from pipelines.palette import SKIN, layer_colour
 from pipelines.run import Run
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import Clearing, clear_motion
 from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
 from recon.cloth.projective import Projecting
@@ -66,6 +67,9 @@ class Animate:
     """How long; 0 = to its end [s]."""
     shape: tuple[float, ...] = ()
     """First coefficients of the body's shape; the rest are 0."""
+    room: float = Clearing.gap
+    """Room between parts of the body [m]: limbs that pass through it are turned, as little as gives cloth room;
+    0 = the motion as recorded."""
     draper: str = ""
     """gaps, simulate or skinning; "" takes gaps for names of GAPS weights and simulates the rest."""
     steps: int = Projecting.steps
@@ -103,12 +107,11 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     began = time.perf_counter()
     body = load_body()
     motion = cut(motion_of(read_clip(config.motion), body, config.fps), config)
+    shape = _shape(config, body)
+    if config.room:
+        motion = clear_motion(motion, body, shape, Clearing(gap=config.room))
     for note in motion.notes:
         say(f"note: {note}")
-    shape = body.neutral().shape.clone()
-    if len(config.shape) > body.n_shape:
-        raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
-    shape[0, : len(config.shape)] = torch.tensor(config.shape)
     run = _open_run(config, say)
     pose = led_in(motion.body(shape))
     with torch.no_grad():
@@ -135,6 +138,15 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
     return Animated(config.out, parts, figures)
 
 
+def _shape(config: Animate, body: Body) -> Tensor:
+    """(1, S) of the body."""
+    if len(config.shape) > body.n_shape:
+        raise UserError(f"--shape: found {len(config.shape)} coefficients; wanted at most {body.n_shape}")
+    shape = body.neutral().shape.clone()
+    shape[0, : len(config.shape)] = torch.tensor(config.shape)
+    return shape
+
+
 def _open_run(config: Animate, say: Callable[[str], None]) -> Run:
     """The animation's folder: its identity is the motion and the garments."""
 
@@ -147,7 +159,7 @@ def _open_run(config: Animate, say: Callable[[str], None]) -> Run:
         "files": [file_digest(g) for g in config.garments if Path(g).is_file()],
         "weights": read_manifest(config.weights),
         "shape": list(config.shape),
-        "part": [config.fps, config.start, config.seconds],
+        "part": [config.fps, config.start, config.seconds, config.room],
     }
     return Run(config.out, identity, evidence, say=tell)
 
@@ -163,6 +175,8 @@ def _check(config: Animate) -> None:
         raise UserError(f"garments: found {', '.join(names)}; wanted different names, none of them body")
     if config.steps < 0:
         raise UserError(f"--steps: found {config.steps}; wanted 0 or more")
+    if config.room < 0:
+        raise UserError(f"--room: found {config.room}; wanted metres, 0 or more")
     if config.fps <= 0:
         raise UserError(f"--fps: found {config.fps}; wanted a positive number")
     if not config.motion.is_file():

@@ -16,6 +16,7 @@ from pipelines.drape_garments import Wardrobe
 from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import Clearance
 from recon.bodies.rig import PARENTS
 from recon.cloth.frames import FrameWeights
 from recon.draping.isp import DisplacementNet, DisplacementShape, Worn, load_isp_draper
@@ -110,7 +111,8 @@ class Loss:
         """Decodes and binds the garments: half a minute."""
         self.config, self.body = config, body
         motions = read_motions(config.motions, config.holdout, body, 30.0)
-        self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread))
+        clearance = Clearance(body, body.neutral().shape)
+        self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread), clearance)
         weights = FrameWeights(collision=config.collision, margin=config.margin, inextensibility=0.0, deep_share=3)
         self.wardrobe = Wardrobe.decoded(
             config.kind, config.garments, config.vertices, body, weights, config.bodies, config.seed

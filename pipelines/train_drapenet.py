@@ -18,6 +18,7 @@ from pipelines.drape_garments import Wardrobe, garments_of
 from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import Clearance
 from recon.cloth.frames import FrameWeights
 from recon.draping.binding import JOINTS, METHODS, BodyField
 from recon.draping.drapenet import GROUPS, DrapeNets, DrapeShape, Prepared, under_top
@@ -175,7 +176,8 @@ class DrapeLoss:
         """Decodes the garments and makes them ready: some seconds each."""
         self.config, self.body, self.nets = config, body, nets
         motions = read_motions(config.motions, config.holdout, body, 30.0)
-        self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread))
+        clearance = Clearance(body, body.neutral().shape)
+        self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread), clearance)
         self.group = "bottom" if config.part == "solver" else config.part
         weights = FrameWeights(collision=config.collision, margin=config.margin, inextensibility=0.0, deep_share=3)
         garments = coarse(GROUPS[self.group], config, config.garments)

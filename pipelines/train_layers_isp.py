@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe, garments_of
-from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
+from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, read_motions
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
+from recon.bodies.clearance import Clearance
 from recon.cloth.energies import collision
 from recon.cloth.frames import FrameWeights
 from recon.draping.isp import Worn, load_isp_draper
@@ -101,7 +102,8 @@ class Loss:
         """Decodes, binds and rasters the garments: half a minute."""
         self.config, self.body = config, body
         motions = read_motions(config.motions, config.holdout, body, 30.0)
-        self.sampler = BodySampler(motions, body.n_shape, Sampling())
+        clearance = Clearance(body, body.neutral().shape)
+        self.sampler = BodySampler(motions, body.n_shape, clearance=clearance)
         self.draper = load_isp_draper(body, config.weights)
         if not self.draper.nets:
             raise UserError(
