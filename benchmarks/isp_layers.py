@@ -72,8 +72,11 @@ class Size:
 FULL, QUICK = Size(25, 4, 80, 8), Size(1, 2, 48, 0)
 
 
-def unseen_bodies(count: int, body: Body, seed: int) -> BodyPose:
-    """Bodies of the population, half of them in poses of the held-out clip, where it is at hand; limbs cleared."""
+def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> BodyPose:
+    """Bodies of the population, half of them in poses of the held-out clip, where it is at hand.
+
+    ``clear``: limbs turned until they don't pass through the body, each by its own shape.
+    """
     generator = torch.Generator().manual_seed(UNSEEN + seed)
     pose = sample_poses(count, generator)
     if CLIP.is_file():
@@ -81,7 +84,9 @@ def unseen_bodies(count: int, body: Body, seed: int) -> BodyPose:
         half = count // 2
         pose[:half] = frames[torch.randint(len(frames), (half,), generator=generator)]
     shape = torch.randn(count, body.n_shape, generator=generator).clamp(-2, 2)
-    return clear_bodies(BodyPose(shape, pose, torch.zeros(count, 3)), body)
+    bodies = BodyPose(shape, pose, torch.zeros(count, 3))
+    with torch.enable_grad():
+        return clear_bodies(bodies, body) if clear else bodies
 
 
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:

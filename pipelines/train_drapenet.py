@@ -11,27 +11,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe, garments_of
 from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
+from pipelines.drapenet_terms import Covered, nearest, outside, pinned, trunk
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
-from recon.bodies.clearance import Clearance
+from recon.bodies.clearance import Clearance, Clearing
 from recon.cloth.frames import FrameWeights
 from recon.draping.binding import JOINTS, METHODS, BodyField
-from recon.draping.drapenet import GROUPS, DrapeNets, DrapeShape, Prepared, under_top
+from recon.draping.drapenet import GROUPS, Displacements, DrapeNets, DrapeShape, Prepared, under_top, widened
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest, read_weights, write_weights
 from recon.garments import load_decoder
+from recon.garments.isp_net import halves_are_fast
 from recon.types import Garment, Mesh, PosedBody, UserError
 
+CLEAR = 0.03
+"""Room between the limbs of poses to learn on, on the neutral body [m]: on bodies of other girths that leaves less."""
 PARTS = ("field", "top", "bottom", "solver")
-COVERED = 0.08
-"""A body point further than this from a garment at rest is not covered by it [m]."""
-OVER = 0.7
-"""Nor is one that has the garment beside it: cosine between the way there and its normal."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +63,21 @@ class TrainDrapenet:
     """Garments per step (pairs, for the solver), each on all of its bodies."""
     skinning: str = "settled"
     """Where W and dx come from: settled or field (see ``DrapeShape``); the field part says it for all."""
+    terms: int = 96
+    """N_B of §3.2.1; networks that learned with fewer go on with so many."""
     points: int = 60_000
     """Points around the body that the field is learned from."""
+    cleared: int = 800
+    """Poses to learn on, drawn once, limbs turned out of the body (a tenth of a second each); 0 = others in each step,
+    as they are drawn, most of them with arms that lie partly in the trunk, where no cloth has room."""
     shape_spread: float = 1.0
     """Standard deviation of the shape coefficients of training bodies, cut at two; the population's is 1."""
     rate: float = 1.5e-3
     """Adam's learning rate at the start; decays along a cosine."""
     collision: float = 2e4
     """Stiffness of contact with the body [J/m³ per vertex]."""
+    usual: float = 0.2
+    """Energies [J] of strain and contact above this count by their logarithm."""
     margin: float = 0.005
     """Distance from the body at which contact begins [m]."""
     pin: float = 50.0
@@ -82,6 +88,11 @@ class TrainDrapenet:
     """Weight of L_layer [J per metre of its mean over the covered body points]."""
     gamma: float = 0.8
     """gamma of Eq. 11."""
+    outside: float = 5000.0
+    """Weight of how far the bottom is outside of the top that covers it [1/m of the mean over covered vertices]: Eq. 11
+    sees what hangs near the body, and of a wide skirt nothing."""
+    apart: float = 0.002
+    """How far inside the top the bottom should be [m]."""
 
 
 def train_drapenet(config: TrainDrapenet) -> Path:
@@ -113,7 +124,7 @@ def begun(config: TrainDrapenet, body: Body) -> tuple[DrapeNets, dict]:
     if "drapenet" not in read_manifest(config.out):
         if config.part != "field":
             raise UserError(f"{config.out}: holds no drapenet; wanted --part field to be learned first")
-        shape = DrapeShape(body.n_shape, skinning=config.skinning)
+        shape = DrapeShape(body.n_shape, terms=config.terms, skinning=config.skinning)
         nets = DrapeNets(shape)
         garments = [g for kinds in GROUPS.values() for g in coarse(kinds, config, config.garments)]
         nets.code.know([g.mesh for g in garments], torch.Generator().manual_seed(config.seed))
@@ -124,7 +135,9 @@ def begun(config: TrainDrapenet, body: Body) -> tuple[DrapeNets, dict]:
     missing = [p for p in ("top", "bottom") if config.part == "solver" and p not in weights.card["parts"]]
     if missing:
         raise UserError(f"{config.out}: --part solver needs {' and '.join(missing)} to be learned first")
-    return nets, weights.card
+    if config.terms > nets.shape.terms and config.part in GROUPS:
+        nets = widened(nets, config.terms)
+    return nets, {**weights.card, "shape": asdict(nets.shape)}
 
 
 def coarse(kinds: tuple[str, ...], config: TrainDrapenet, count: int) -> list[Garment]:
@@ -176,8 +189,9 @@ class DrapeLoss:
         """Decodes the garments and makes them ready: some seconds each."""
         self.config, self.body, self.nets = config, body, nets
         motions = read_motions(config.motions, config.holdout, body, 30.0)
-        clearance = Clearance(body, body.neutral().shape)
-        self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread), clearance)
+        sampling = Sampling(shape_spread=config.shape_spread, pool=config.cleared)
+        clearance = Clearance(body, body.neutral().shape, Clearing(gap=CLEAR)) if config.cleared else None
+        self.sampler = BodySampler(motions, body.n_shape, sampling, clearance)
         self.group = "bottom" if config.part == "solver" else config.part
         weights = FrameWeights(collision=config.collision, margin=config.margin, inextensibility=0.0, deep_share=3)
         garments = coarse(GROUPS[self.group], config, config.garments)
@@ -186,10 +200,15 @@ class DrapeLoss:
             skinning = SkinningDraper(body)
             self.ready = [nets.prepare(g.mesh, self.group, nets.bound(g.mesh, skinning)) for g in garments]
             self.held = [trunk(g, body) if self.group == "bottom" else None for g in garments]
+            self.overlap = torch.zeros(len(garments), 0)
+            self.covered: dict[tuple[int, int], Covered] = {}
             self.tops = []
             if config.part == "solver":
                 tops = coarse(GROUPS["top"][:1], config, config.garments // 2)
                 self.tops = [(g, nets.prepare(g.mesh, "top", nets.bound(g.mesh, skinning))) for g in tops]
+                hems = torch.stack([g.mesh.vertices[:, 1].min() for g in tops])
+                waists = torch.stack([g.mesh.vertices[:, 1].max() for g in garments])
+                self.overlap = (waists[:, None] - hems).clamp_min(0.01)  # what hardly meets has little to teach
 
     def __call__(self, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         """The loss of one random batch, and its terms per drape [J]."""
@@ -201,16 +220,19 @@ class DrapeLoss:
         for k in torch.randperm(len(self.ready), generator=generator)[: c.worn].tolist():
             ready, above = self.ready[k], None
             if self.tops:
-                garment, above = self.tops[int(torch.randint(len(self.tops), (), generator=generator))]
+                over = int(torch.multinomial(self.overlap[k], 1, generator=generator))
+                above = self.tops[over][1]
             moved = self._moved(ready, above, body)
             x = ready.place(moved, body)
             energy, terms = self.wardrobe.physics[k](x)
-            loss = energy.mean()
             if self.held[k] is not None:
-                loss = loss + c.pin * pinned(moved[:, self.held[k]], c.pin_side).mean()
+                energy = energy + c.pin * pinned(moved[:, self.held[k]], c.pin_side)
+            # Tight clothes on large bodies store many times the energy of others, and would be all that is learned.
+            loss = (energy / (terms["strain"] + terms["collision"] + c.usual).to(energy)).mean()
             if above is not None:
-                crossing = self._layer(k, x, garment, above, body)
-                loss, shown["layer"] = loss + c.layer * crossing, 1e3 * float(crossing.detach())
+                crossing, outside = self._layer(k, x, over, body)
+                loss = loss + c.layer * crossing + c.outside * outside
+                shown |= {"layer": 1e3 * float(crossing.detach()), "outside": 1e3 * float(outside.detach())}
             total = total + loss / c.worn
             for name, value in terms.items():
                 shown[name] = shown.get(name, 0.0) + float(value.mean()) / c.worn
@@ -219,82 +241,49 @@ class DrapeLoss:
     def _moved(self, ready: Prepared, above: Prepared | None, body: PosedBody) -> Tensor:
         """(B, N, 3): the part that learns anew, the others as they were made ready."""
         if above is None:
-            net = self.nets.displacements(self.group)
-            return net(net.matrix(ready.rest, ready.code), body)
+            return self._learned(self.nets.displacements(self.group), ready.rest, ready.code, body)
         with torch.no_grad():
             fixed = self.nets.displacements("bottom")(ready.matrix, body)
-        solver = self.nets.solver
-        return fixed + solver(solver.matrix(ready.rest, torch.cat([above.code, ready.code])), body)
+        codes = torch.cat([above.code, ready.code])
+        return fixed + self._learned(self.nets.solver, ready.rest, codes, body)
 
-    def _layer(self, k: int, x: Tensor, garment: Garment, above: Prepared, body: PosedBody) -> Tensor:
-        """() mean of Eq. 11 over bodies and covered points [m]."""
+    @staticmethod
+    def _learned(net: Displacements, x: Tensor, code: Tensor, body: PosedBody) -> Tensor:
+        """(B, N, 3), in halves where they are faster."""
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=halves_are_fast(x.device)):
+            return net(net.matrix(x, code), body).float()
+
+    def _layer(self, k: int, x: Tensor, over: int, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """Of bottom ``k`` at x under top ``over``: () mean of Eq. 11 over bodies and covered points [m], and of
+        :func:`outside`."""
+        garment, above = self.tops[over]
         with torch.no_grad():
             top = above.place(self.nets.displacements("top")(above.matrix, body), body)
-        covered = Covered.of(self.body, garment.mesh, self.wardrobe.garments[k].mesh)
+        if (k, over) not in self.covered:
+            self.covered[k, over] = Covered.of(self.body, garment.mesh, self.wardrobe.garments[k].mesh)
+        covered = self.covered[k, over]
         points = body.mesh.vertices[:, covered.points]
         lower, upper = nearest(points, x, covered.bottom), nearest(points, top, covered.top)
-        return (under_top(lower, upper, self.config.gamma) / max(len(covered.points), 1)).mean()
-
-
-def pinned(moved: Tensor, side: float) -> Tensor:
-    """L_pin of Eq. 8: displacements (B, V, 3) -> (B,); mostly the vertical ones pay."""
-    return (moved.square() * moved.new_tensor([side, 1.0, side])).sum((1, 2))
-
-
-def trunk(garment: Garment, body: Body) -> Tensor:
-    """(V,) vertices whose closest body vertex belongs to the trunk (§7.2)."""
-    rest = body.rest(body.neutral().shape).vertices[0]
-    nearest_vertex = cKDTree(rest.numpy()).query(garment.mesh.vertices.detach().numpy())[1]
-    return body.region_mask("torso")[torch.as_tensor(nearest_vertex)].nonzero().flatten()
-
-
-@dataclass(frozen=True)
-class Covered:
-    """Body points under both garments (C of Eq. 11), and the garments' vertices over them at rest."""
-
-    points: Tensor
-    """(C,) body vertices."""
-    top: Tensor
-    """(C, K) vertices of the top."""
-    bottom: Tensor
-    """(C, K) vertices of the bottom."""
-
-    @classmethod
-    def of(cls, body: Body, top: Mesh, bottom: Mesh, neighbours: int = 8) -> Covered:
-        """From both garments at rest on the neutral body."""
-        rest = body.rest(body.neutral().shape).vertices[0]
-        tried = body.region_mask("torso", "legs").nonzero().flatten()
-        normal = _normals(rest, body.faces)[tried]
-        over, chosen = [], torch.ones(len(tried), dtype=torch.bool)
-        for mesh in (top, bottom):
-            x = mesh.vertices.detach()
-            distance, index = cKDTree(x.numpy()).query(rest[tried].numpy(), k=neighbours)
-            at = torch.as_tensor(index)
-            away = torch.nn.functional.normalize(x[at[:, 0]] - rest[tried], dim=1)
-            chosen &= (torch.as_tensor(distance[:, 0]) < COVERED) & ((away * normal).sum(1) > OVER)
-            over.append(at)
-        return cls(tried[chosen], over[0][chosen], over[1][chosen])
-
-
-def _normals(x: Tensor, faces: Tensor) -> Tensor:
-    a, b, c = x[faces].unbind(1)
-    normal = torch.linalg.cross(b - a, c - a).repeat_interleave(3, 0)
-    return torch.nn.functional.normalize(torch.zeros_like(x).index_add(0, faces.reshape(-1), normal), dim=1)
-
-
-def nearest(points: Tensor, x: Tensor, over: Tensor) -> Tensor:
-    """(B, C) distance of points (B, C, 3) to the nearest of their vertices x[over], over (C, K) [m]."""
-    return (x[:, over] - points[:, :, None]).square().sum(-1).amin(-1).clamp_min(1e-12).sqrt()
+        crossing = under_top(lower, upper, self.config.gamma) / max(len(covered.points), 1)
+        return crossing.mean(), outside(
+            x, self.wardrobe.garments[k].mesh.faces, Mesh(top, garment.mesh.faces), self.config.apart
+        )
 
 
 def store(nets: DrapeNets, card: dict, config: TrainDrapenet, done: Training) -> Path:
     """Write ``drapenet`` with its card; a part learned anew replaces its entry."""
     data = f"{config.garments} garments of the shipped decoders; motion clips of {config.motions.name} and their "
     data += f"mirror images (held out: {', '.join(config.holdout)}), random poses within the joints' limits"
+    if config.cleared:
+        data += f"; {config.cleared} such poses, limbs turned out of the body"
     part = {
         "data": "the body's own weights and shape directions" if config.part == "field" else data,
         **done.card(config),
     }
+    if config.part in card["parts"]:  # it went on from there
+        part["before"] = {
+            k: v for k, v in card["parts"][config.part].items() if k in ("steps", "minutes", "before", "begin")
+        }
     entry = {
         "what": "DrapeNet's draping networks: skinning field, displacements of tops and bottoms, intersection solver",
         "shape": card["shape"],

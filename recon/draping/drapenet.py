@@ -23,8 +23,10 @@ from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
 from recon.cloth.contact import BodyContact
 from recon.draping.isp import pose_features
+from recon.draping.nodes import Nodes
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_weights
+from recon.garments.isp_net import CHUNK, halves_are_fast
 from recon.types import Garment, Mesh, PosedBody, UserError
 
 GROUPS: dict[str, tuple[str, ...]] = {"top": ("top", "dress"), "bottom": ("trousers", "skirt")}
@@ -34,6 +36,10 @@ CHEST = JOINT_NAMES.index("spine3")
 FARTHEST = 0.15
 """Distances from the fixed points count up to this [m]."""
 POSE_FEATURES = 23 * 6 + 3
+NODE_WIDTH = 0.0125
+"""Distance of the nodes at which a fine mesh asks the networks [m]: draped vertices are 0.3 mm off in the mean."""
+MANY = 20_000
+"""Meshes of more vertices than this may be finer than the nodes."""
 
 
 def waves(x: Tensor, octaves: int) -> Tensor:
@@ -55,6 +61,26 @@ def mlp(inputs: int, width: int, depth: int, outputs: int, last: float = 1.0) ->
     return nn.Sequential(*layers, out)
 
 
+def quickly(net: nn.Sequential, x: Tensor) -> Tensor:
+    """An ``mlp`` at (N, C) points without gradient, its inner layers in half precision where that is faster."""
+    first, *inner, last = (layer for layer in net if isinstance(layer, nn.Linear))
+    halves = torch.bfloat16 if halves_are_fast(x.device) and x.dtype == torch.float32 else x.dtype
+    hidden = [(layer.weight.to(halves), layer.bias.to(halves)) for layer in inner]
+    out = x.new_empty(len(x), last.out_features)
+    for rows, part in zip(out.split(CHUNK), x.split(CHUNK), strict=True):
+        h = F.silu(first(part), inplace=True).to(halves)
+        for k, (weight, bias) in enumerate(hidden, 1):
+            h = F.linear(h, weight, bias)
+            h = F.silu(h if k < len(hidden) else h.to(x.dtype), inplace=True)
+        torch.addmm(last.bias, h.to(x.dtype), last.weight.T, out=rows)
+    return out
+
+
+def silent(net: nn.Module, *inputs: Tensor) -> bool:
+    """Whether nobody asks for gradients through a network."""
+    return not torch.is_grad_enabled() or not any(t.requires_grad for t in (*inputs, *net.parameters()))
+
+
 class BodyFieldNet(nn.Module):
     """W(x) and dx(x, beta): the body's skinning weights and shape directions carried into the space around it."""
 
@@ -64,9 +90,13 @@ class BodyFieldNet(nn.Module):
         self.octaves = octaves
         self.net = mlp(3 + 6 * octaves, width, depth, JOINTS + 3 * n_shape)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3) points in the neutral body's T-pose space -> weights (N, 24), sum 1; directions (N, 3, S) [m]."""
-        out = self.net(waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.octaves))
+    def forward(self, x: Tensor, quick: bool = False) -> tuple[Tensor, Tensor]:
+        """(N, 3) points in the neutral body's T-pose space -> weights (N, 24), sum 1; directions (N, 3, S) [m].
+
+        ``quick``: see :func:`quickly`.
+        """
+        seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.octaves)
+        out = quickly(self.net, seen) if quick else self.net(seen)
         return out[:, :JOINTS].softmax(1), 0.01 * out[:, JOINTS:].unflatten(1, (3, -1))
 
 
@@ -99,10 +129,11 @@ class Displacements(nn.Module):
         inputs = 3 + 6 * shape.octaves + shape.code
         self.maps = mlp(inputs, shape.width, shape.depth, 3 * shape.terms, last=0.1)
 
-    def matrix(self, x: Tensor, code: Tensor) -> Tensor:
-        """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]."""
+    def matrix(self, x: Tensor, code: Tensor, quick: bool = False) -> Tensor:
+        """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]; ``quick``: see :func:`quickly`."""
         seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
-        out = self.maps(torch.cat([seen, code.expand(len(x), -1)], 1))
+        seen = torch.cat([seen, code.expand(len(x), -1)], 1)
+        out = quickly(self.maps, seen) if quick else self.maps(seen)
         return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1).contiguous()
 
     def embedding(self, body: PosedBody) -> Tensor:
@@ -154,29 +185,48 @@ class RestCode(nn.Module):
 
 @dataclass(frozen=True)
 class Prepared:
-    """All that is known of a garment before the body moves."""
+    """All that is known of a garment before the body moves.
+
+    Of a fine mesh, directions and matrices are known at M nodes around it; else M = N.
+    """
 
     rest: Tensor
     """(N, 3) [m]."""
     weights: Tensor
     """(N, 24)."""
     directions: Tensor
-    """(N, 3, S) [m]."""
+    """(N, 3, S) or, of the learned field, (M, 3, S) [m]."""
     matrix: Tensor
-    """(N_B, N, 3) [m]."""
+    """(N_B, M, 3) [m]."""
     code: Tensor
     """(z,)."""
     solved: Tensor | None = None
-    """(N_B, N, 3) the intersection solver's matrix, under a given garment above."""
+    """(N_B, M, 3) the intersection solver's matrix, under a given garment above."""
+    nodes: Nodes | None = None
+    """What reads matrices between M nodes; None: they are known at each vertex."""
+    shape_nodes: Nodes | None = None
+    """The same of the directions."""
 
     def moved(self, nets: DrapeNets, group: str, body: PosedBody) -> Tensor:
         """(B, N, 3) what is added to the shaped garment before it is skinned [m]."""
         out = nets.displacements(group)(self.matrix, body)
-        return out if self.solved is None else out + nets.solver(self.solved, body)
+        if self.solved is not None:
+            out = out + nets.solver(self.solved, body)
+        return between(self.nodes, out)
 
     def place(self, moved: Tensor, body: PosedBody) -> Tensor:
         """(B, N, 3) displacements -> vertices in the world (Eq. 6)."""
-        return skin(shaped(self.rest, self.directions, body.shape) + moved, body.transforms, self.weights)
+        if self.shape_nodes is None:
+            return skin(shaped(self.rest, self.directions, body.shape) + moved, body.transforms, self.weights)
+        by_shape = shaped(self.rest.new_zeros(3), self.directions, body.shape)
+        return skin(self.rest + between(self.shape_nodes, by_shape) + moved, body.transforms, self.weights)
+
+
+def between(nodes: Nodes | None, values: Tensor) -> Tensor:
+    """(B, M, 3) at nodes -> (B, N, 3) at the vertices between them."""
+    if nodes is None:
+        return values
+    return nodes(values.transpose(0, 1).flatten(1)).unflatten(1, (-1, 3)).transpose(0, 1)
 
 
 Bound = tuple[Tensor, Tensor]
@@ -192,6 +242,8 @@ class DrapeNets(nn.Module):
         self.code = RestCode(size=shape.code)
         self.drape = nn.ModuleDict({group: Displacements(shape) for group in GROUPS})
         self.shape = shape
+        self.exact = False
+        """Whether :meth:`prepare` asks the networks at each vertex in full precision."""
         self.solver = Displacements(replace(shape, code=2 * shape.code, terms=24, width=96, depth=3))
 
     def displacements(self, group: str) -> Displacements:
@@ -204,21 +256,50 @@ class DrapeNets(nn.Module):
         """Skinning of a mesh as these networks learned it; None = the learned field's."""
         return skinning.bind(mesh.vertices, mesh.faces) if self.shape.skinning == "settled" else None
 
-    def prepare(self, mesh: Mesh, group: str, bound: Bound | None = None, above: Tensor | None = None) -> Prepared:
+    def prepare(
+        self,
+        mesh: Mesh,
+        group: str,
+        bound: Bound | None = None,
+        above: Tensor | None = None,
+        code: Tensor | None = None,
+    ) -> Prepared:
         """A mesh at rest on the neutral body, made ready.
+
+        Where nobody asks for gradients and ``exact`` is not set, the networks are asked in half precision, and of
+        meshes of many vertices at nodes ``NODE_WIDTH`` apart.
 
         Args:
             mesh: (N, 3) vertices; differentiable in them, the code held.
             group: key of ``GROUPS``.
             bound: skinning weights (N, 24) and shape directions (N, 3, S); None = the learned field's.
             above: (z,) code of the garment over it, for the solver.
+            code: (z,) the mesh's own, where it is known; differentiable in it.
         """
-        x = mesh.vertices
-        code = self.code(mesh)
-        weights, directions = self.field(x) if bound is None else bound
-        matrix = self.displacements(group).matrix(x, code)
-        solved = None if above is None else self.solver.matrix(x, torch.cat([above, code]))
-        return Prepared(x, weights, directions, matrix, code, solved)
+        x, net = mesh.vertices, self.displacements(group)
+        code = self.code(mesh) if code is None else code
+        quick = not self.exact and silent(self, x, code)
+        nodes = Nodes.around(x, NODE_WIDTH) if quick and len(x) > MANY else None
+        at = x if nodes is None else nodes.at
+        weights, directions = self.field(at, quick) if bound is None else bound
+        shape_nodes = nodes if bound is None else None
+        if shape_nodes is not None:
+            weights = shape_nodes(weights)
+        matrix = net.matrix(at, code, quick)
+        solved = None if above is None else self.solver.matrix(at, torch.cat([above, code]), quick)
+        return Prepared(x, weights, directions, matrix, code, solved, nodes, shape_nodes)
+
+
+def widened(nets: DrapeNets, terms: int) -> DrapeNets:
+    """Networks that drape as these do, with more terms N_B to learn in; the new ones' maps start at zero."""
+    wide = DrapeNets(replace(nets.shape, terms=terms))
+    own = wide.state_dict()
+    for name, value in nets.state_dict().items():
+        if own[name].shape != value.shape and ".maps." in name:
+            own[name].zero_()
+        own[name][: len(value)] = value
+    wide.load_state_dict(own)
+    return wide
 
 
 def group_of(kind: str) -> str:

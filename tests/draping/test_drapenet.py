@@ -17,6 +17,7 @@ from recon.draping.drapenet import (
     load_drapenet,
     under_top,
     waves,
+    widened,
 )
 from recon.files.weights import write_weights
 from recon.garments.dataset import load_garments
@@ -66,6 +67,41 @@ def test_displacement_is_linear_in_the_embedding(nets):
     assert torch.allclose(moved, by_hand, atol=1e-6)
     halves = [nets.prepare(Mesh(TOPS[0].mesh.vertices, f), "top") for f in TOPS[0].mesh.faces.split(1000)]
     assert halves[0].matrix.shape == ready.matrix.shape
+
+
+@pytest.mark.parametrize("kind", ["top", "trousers"])
+def test_the_quick_way_agrees_with_each_vertex_in_full(kind):
+    """Shipped networks, a mesh of 30,000 vertices: the product's way through halves and nodes, and the exact one."""
+    draper, body = load_drapenet(BODY), posed(3)
+    garment = load_garments(kind, "test")[1].mesh
+    pick = torch.arange(30_000) % len(garment.vertices)
+    noise = 1e-3 * torch.randn(30_000, 3, generator=torch.Generator().manual_seed(0))
+    for mesh in (garment, Mesh(garment.vertices[pick] + noise, garment.faces)):
+        drapes = []
+        for exact in (False, True):
+            draper.nets.exact = exact
+            ready = draper.nets.prepare(mesh, group_of(kind), code=draper.nets.code(garment))
+            drapes.append(ready.place(ready.moved(draper.nets, group_of(kind), body), body))
+            assert (ready.nodes is not None) == (len(mesh.vertices) == 30_000 and not exact)
+        off = (drapes[0] - drapes[1]).norm(dim=-1)
+        assert off.mean() < 4e-4 and off.flatten().quantile(0.99) < 3e-3 and off.max() < 0.02
+
+
+def test_asked_for_gradients_networks_are_asked_in_full(nets):
+    draper = DrapeNetDraper(nets, BODY)
+    mesh, net = TOPS[0].mesh, nets.displacements("top")
+    code = draper.nets.code(mesh).requires_grad_()
+    ready = draper.nets.prepare(mesh, "top", code=code)
+    ready.moved(draper.nets, "top", posed()).sum().backward()
+    assert code.grad is not None and code.grad.abs().sum() > 0
+    assert torch.equal(ready.matrix, net.matrix(mesh.vertices, code))
+
+
+def test_widened_networks_drape_as_before(nets):
+    wide, body = widened(nets, 9), posed()
+    assert wide.shape.terms == 9
+    before, after = (n.prepare(TOPS[0].mesh, "top").moved(n, "top", body) for n in (nets, wide))
+    assert torch.allclose(before, after, atol=1e-6)
 
 
 def test_where_and_whither_a_person_stands_and_turns_about_up_does_not_matter(nets):

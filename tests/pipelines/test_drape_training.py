@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 
 from pipelines.drape_training import BodySampler, Sampling
+from recon.bodies import load_body
+from recon.bodies.clearance import Clearance, Clearing
 from recon.bodies.pose_prior import joint_limits
 from recon.bodies.poses import stroll
 
@@ -46,3 +48,14 @@ def test_calm_poses_lie_on_the_way_to_t() -> None:
     clip = motion.pose[:, 1:].flatten(1)
     cosine = torch.nn.functional.normalize(calm, dim=1) @ torch.nn.functional.normalize(clip, dim=1).T
     assert (cosine.max(1).values > 0.999).all()
+
+
+def test_cleared_poses_are_fewer_and_hardly_pass_through_the_body() -> None:
+    body = load_body()
+    clearance = Clearance(body, body.neutral().shape, Clearing(gap=0.0))
+    settings = Sampling(clips=0.0, pool=6)
+    found = BodySampler([], body.n_shape, settings, clearance)(30, torch.Generator().manual_seed(1))
+    drawn = BodySampler([], body.n_shape, settings)(30, torch.Generator().manual_seed(1))
+    assert len(found.pose.unique(dim=0)) <= 6 < len(drawn.pose.unique(dim=0))
+    assert clearance.deepest(drawn.pose).max() > 0.02
+    assert clearance.deepest(found.pose).max() < 0.5 * clearance.deepest(drawn.pose).max()
