@@ -40,8 +40,8 @@ from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
 
 DRAPERS = ("gaps", "simulate", "skinning")
 WRITERS = ("glb", "obj", "pc2", "gif", "mp4")
-ROUNDS = 16
-"""Most rounds of untangling per frame: what has no room in one frame mostly has none in the next."""
+ROUNDS, TRIES = 16, 2
+"""Most rounds and tries of untangling per frame: what has no room in one frame mostly has none in the next."""
 CHUNK = 20
 """Frames that are untangled between two times that this is kept."""
 LEAD_IN = 24
@@ -243,7 +243,7 @@ def untangled_in_stages(run: Run, worn: Sequence[Moving], posed: PosedBody, body
     for first in range(0, count, CHUNK):
         part = slice(first, min(first + CHUNK, count))
         job = lambda _, part=part: untangled(worn, posed, body, part)  # noqa: E731
-        done.append(run.stage(f"untangle-{first:05d}", job, config=[ROUNDS, CHUNK]))
+        done.append(run.stage(f"untangle-{first:05d}", job, config=[ROUNDS, TRIES, CHUNK]))
     frames = [torch.cat([chunk[0][k] for chunk in done]) for k in range(len(worn))]
     how = {key: sum((chunk[1][key] for chunk in done), start=type(done[0][1][key])()) for key in done[0][1]}
     how["notes"] = how["notes"][:20]
@@ -258,7 +258,7 @@ def untangled(
     clean, crossings, notes = 0, 0, list[str]()
     for k in range(len(posed.mesh.vertices))[part]:
         layers = [Mesh(own.frames[k], own.faces) for own in worn]
-        done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces), Untangling(rounds=ROUNDS))
+        done = untangle(layers, Mesh(posed.mesh.vertices[k], body.faces), Untangling(rounds=ROUNDS, tries=TRIES))
         clean += done.clean
         crossings += done.crossings
         notes += [f"frame {k}: {note}" for note in done.notes]
