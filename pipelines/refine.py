@@ -57,7 +57,7 @@ class Refinement:
     """Body and layers are in each other's way within this distance [m]."""
     margin: float = 5e-4
     """Distance from the body that every vertex and face centre ends with [m]."""
-    untangling: int = 120
+    untangling: int = 30
     """Most rounds of drawing apart what passes through itself or another layer; 0 = without."""
 
 
