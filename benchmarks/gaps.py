@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from draping import tube
 
+from pipelines.gaps_drapes import Teaching
 from pipelines.sequence import led_in, measure, untangled
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import clear_motion
@@ -79,15 +80,17 @@ def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000, repeats:
     """Milliseconds a frame of a garment of ``vertices``, skeleton posed as well.
 
     One by one, without and with the body's own vertices, with projective steps too, and all frames at once (with the
-    body's vertices, without steps).
+    body's vertices, without steps); the same of a last layer that mixes few drapes, as networks learned from drapes
+    have it; and the CPU time of one frame.
     """
     net = GapsNet(GapsShape(vertices, body.n_shape))
+    few = GapsNet(GapsShape(vertices, body.n_shape, rank=Teaching.rank))
     pose = torch.zeros(frames, 24, 3)
     pose[:, 16, 2] = torch.linspace(-1.2, 0, frames)
     whole = BodyPose(torch.zeros(frames, body.n_shape), pose, torch.zeros(frames, 3))
     made = tube(vertices // 50, 50)
     bound = Bound.of(made.vertices, made.faces, body)
-    draper = GapsDraper(net, made, bound)
+    draper, brief = GapsDraper(net, made, bound), GapsDraper(few, made, bound)
     stepping = GapsDraper(net, made, bound, Projective(Cloth.from_mesh(made), bound.weights))
     each = [whole[k] for k in range(frames)]
     ways = {
@@ -95,17 +98,21 @@ def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000, repeats:
         "with_body_mesh": lambda: deque(draper.stream((p for p in each if body.pose(p)), body, 30.0), maxlen=0),
         "with_steps": lambda: deque(stepping.stream(each, body, 30.0), maxlen=0),
         "at_once": lambda: draper.animate(body.pose(whole), whole, 30.0),
+        "few_drapes": lambda: deque(brief.stream(each, body, 30.0), maxlen=0),
+        "few_drapes_at_once": lambda: brief.animate(body.pose(whole), whole, 30.0),
     }
-    figures = {}
+    figures: dict[str, float] = {"threads": torch.get_num_threads()}
     with torch.no_grad():
         for name, run in ways.items():
             run()
-            times = []
+            times, busy = [], []
             for _ in range(repeats):
-                begin = time.perf_counter()
+                begin, cpu = time.perf_counter(), time.process_time()
                 run()
                 times.append((time.perf_counter() - begin) * 1e3 / frames)
-            figures[name] = round(statistics.median(times), 3)
+                busy.append((time.process_time() - cpu) * 1e3 / frames)
+            for key, values in ((name, times), (f"{name}_cpu", busy)):
+                figures[key] = round(statistics.median(values), 3)
     return figures
 
 
@@ -320,6 +327,9 @@ def page(found: dict) -> str:
         f"{t['one_by_one']} ms a frame one by one, skeleton posed too ({t['with_body_mesh']} with the body's mesh,",
         f"{t['with_steps']} with projective steps as well);",
         f"{t['at_once']} ms all at once, mesh and all (garment of 5000 vertices).",
+        f"Of a last layer that mixes {Teaching.rank} drapes: {t['few_drapes']} and {t['few_drapes_at_once']} ms.",
+        f"CPU time of these frames: {t['one_by_one_cpu']}, {t['at_once_cpu']}, {t['few_drapes_cpu']} and",
+        f"{t['few_drapes_at_once_cpu']} ms ({t['threads']} threads; other work ran beside it).",
     ]
     lines += [
         "",

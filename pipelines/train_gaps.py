@@ -1,5 +1,8 @@
 """Train GAPS for one garment, self-supervised by physics: ``recon train gaps --garment top:test:7 --motions FOLDER``.
 
+With ``--drapes N`` it goes on from a network that is there, by N windows of that network's own drapes after projective
+steps (:mod:`pipelines.gaps_drapes`): still no simulation, and a fraction of the time.
+
 Windows of motion, random shapes: the network's drapes are pulled towards rest by strain, bending, gravity, collision,
 inertia and the collision-aware inextensibility (GAPS Eq. 9-17). No simulated drapes are needed. The paper's baselines
 run in the same frame: SNUG's is ``--skinning nearest --inextensibility 0``, NCS' ``--skinning smoothed
@@ -15,6 +18,7 @@ import torch
 from torch import Tensor
 
 from pipelines.drape_training import ARMS, CLIP_TERMS, HELD_OUT, read_motions
+from pipelines.gaps_drapes import DrapeLoss, Edges, Teaching, drapes, pupil
 from pipelines.garment_source import load_garment
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
@@ -24,7 +28,7 @@ from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
 from recon.draping.dress import held_vertices
-from recon.draping.gaps import Bound, GapsNet, GapsShape, motion_features, smooth_basis
+from recon.draping.gaps import Bound, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
 from recon.files.weights import write_weights
 from recon.garments.panels import border_loops
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
@@ -83,6 +87,12 @@ class TrainGaps:
     """k_c of Eq. 11 [J/m³ per vertex]; the paper's 250 leaves more in the body on our finer meshes."""
     margin: float = 0.003
     """Distance from the body at which collision begins [m]."""
+    start: Path | None = None
+    """Folder with weights of this name and garment that make drapes to learn from; None takes the shipped ones."""
+    drapes: int = 0
+    """Learn from so many windows of drapes (a network's, after projective steps) instead of from physics."""
+    teaching: Teaching = Teaching()
+    """How drapes are made and learned from."""
     pin: float = 20.0
     """Stiffness that keeps a waistband where skinning has it [J/m² per vertex]."""
 
@@ -127,7 +137,7 @@ def train_gaps(config: TrainGaps) -> Path:
     template = Template.of(load_garment(config.garment), body)
     if not border_loops(template.mesh.faces.numpy()):
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")
-    training = learn(template, motions, body, config)
+    training = (learn_drapes if config.drapes else learn)(template, motions, body, config)
     assert isinstance(training.module, GapsNet)
     return store(training.module.folded(), template, body, config, training)
 
@@ -143,6 +153,29 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
     generator = torch.Generator().manual_seed(config.seed + training.step)
     loss = Loss(template, motions, body, config)
     training.run(Budget(config.minutes, config.steps), lambda share: loss(net, share, generator))
+    return training
+
+
+def learn_drapes(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
+    """Training on drapes of a network that is there.
+
+    Raises:
+        UserError: no such network, or one of another garment.
+    """
+    draper = load_gaps(config.name, body, config.start)
+    mesh = draper.garment.mesh if isinstance(draper.garment, Garment) else draper.garment
+    if not torch.equal(mesh.faces, template.mesh.faces):
+        raise UserError(f"gaps-{config.name}: found a network of another garment than {config.garment}")
+    kept = config.out / f"gaps-{config.name}.drapes"
+    known = drapes(draper, motions, body, config.drapes, config.teaching, kept)
+    edges = Edges(template.mesh)
+    net = pupil(draper.net, known, edges, config.teaching, config.seed)
+    adam = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], config.teaching.rate, fused=True)
+    training = Training(f"gaps-{config.name}", net, adam, settings_of(config), config.out)
+    training.resume()
+    generator = torch.Generator().manual_seed(config.seed + training.step)
+    loss = DrapeLoss(known, edges, draper.bound, body, config.teaching)
+    training.run(Budget(config.minutes, config.steps), lambda _: loss(net, generator))
     return training
 
 
@@ -224,6 +257,8 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         **done.card(config),
         "licence": CLIP_TERMS,
     }
+    if config.drapes:
+        card["taught"] = f"by {config.drapes} windows of drapes of the network before it, after projective steps"
     if isinstance(thing, Garment):
         names = ("panel_points", "panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
         tensors |= {f"garment.{name}": getattr(thing, name) for name in names}

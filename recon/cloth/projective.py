@@ -93,13 +93,35 @@ class Projective:
     @torch.no_grad()
     def __call__(self, guess: Tensor, body: PosedBody) -> Tensor:
         """Guesses (B, V, 3) on B bodies -> as many drapes; not differentiable, computed on the CPU."""
-        faces = body.mesh.faces
         if not len(guess):
             return guess.clone()
+        skin = self._skin(body)
+        found = [self._one(x, skin, b) for x, b in zip(guess, body.mesh.vertices, strict=True)]
+        return torch.stack(found)
+
+    @torch.no_grad()
+    def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
+        """The body beside cloth (B, V, 3), as the steps see it: normals (B, V, 3), zero where it is out of reach or not
+        to be left, and distances (B, V) from these planes [m]."""
+        skin, normals, gaps = self._skin(body), [], []
+        for one, b in zip(x, body.mesh.vertices, strict=True):
+            self.x.numpy()[:] = one.cpu().double().numpy()
+            self._look(skin, skin.posed(b))
+            normals.append(torch.from_numpy(self.normal.numpy().copy()))
+            gaps.append(torch.from_numpy(((self.x.numpy() - self.point.numpy()) * self.normal.numpy()).sum(1)))
+        return torch.stack(normals).to(x), torch.stack(gaps).to(x)
+
+    def _skin(self, body: PosedBody) -> _Skin:
+        faces = body.mesh.faces
         if self._body is None or self._body.faces is not faces:
             self._body = _Skin(body.mesh.vertices[0], faces, body.weights)
-        found = [self._one(x, self._body, b) for x, b in zip(guess, body.mesh.vertices, strict=True)]
-        return torch.stack(found)
+        return self._body
+
+    def _look(self, skin: _Skin, mesh: wp.Mesh) -> None:
+        """Find the planes beside the cloth as it is."""
+        s = self.settings
+        ask = [mesh.id, skin.parts, s.reach, s.akin, s.shallow]
+        wp.launch(_search, self.count, [*ask, self.x, self.parts, self.point, self.normal], device=DEVICE)
 
     def _one(self, guess: Tensor, skin: _Skin, body: Tensor) -> Tensor:
         s, mesh = self.settings, skin.posed(body)
@@ -112,8 +134,7 @@ class Projective:
             wp.launch(_agree, 1, [self.x, self.right, self.faces, self.inverse, self.areas], device=DEVICE)
             x[:] = self.solve(right)
             if k % s.search == 0:
-                ask = [mesh.id, skin.parts, s.reach, s.akin, s.shallow]
-                wp.launch(_search, self.count, [*ask, self.x, self.parts, self.point, self.normal], device=DEVICE)
+                self._look(skin, mesh)
             contact = [self.x, self.point, self.normal, *limits]
             wp.launch(_leave, self.count, contact, device=DEVICE)
         return torch.from_numpy(x.copy()).to(guess)

@@ -65,7 +65,7 @@ class GapsNet(nn.Module):
         self.shape = shape
         self.register_buffer("basis", basis, persistent=False)
         self.gru = nn.GRU(FEATURES + shape.n_shape, shape.width, shape.layers, batch_first=True)
-        self.few = nn.Linear(shape.width, shape.rank, bias=False) if shape.rank else nn.Identity()
+        self.few = nn.Linear(shape.width, shape.rank) if shape.rank else nn.Identity()
         self.out = nn.Linear(shape.rank or shape.width, 3 * (shape.vertices if basis is None else basis.shape[1]))
         nn.init.normal_(self.out.weight, 0.0, 0.01)
         nn.init.zeros_(self.out.bias)
@@ -78,8 +78,12 @@ class GapsNet(nn.Module):
     def forward(self, features: Tensor, shape: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """As ``remember`` -> displacements (B, T, V, 3) [m], hidden."""
         states, hidden = self.remember(features, shape, hidden)
+        return self.displaced(states), hidden
+
+    def displaced(self, states: Tensor) -> Tensor:
+        """States (B, T, W) -> displacements (B, T, V, 3) [m]."""
         moved = self.out(self.few(states)).unflatten(-1, (-1, 3))
-        return self.shape.scale * (moved if self.basis is None else self.basis @ moved), hidden
+        return self.shape.scale * (moved if self.basis is None else self.basis @ moved)
 
     def folded(self) -> GapsNet:
         """The same function without a basis: its columns are multiplied into the last layer."""
@@ -163,6 +167,16 @@ class Bound:
     def place(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
         """Displacements (B, V, 3), joint transforms (B, 24, 4, 4), shapes (B, S) -> posed vertices (B, V, 3)."""
         return skin(self.shaped(shape) + moved, transforms, self.weights)
+
+    def unposed(self, moved: Tensor, transforms: Tensor) -> Tensor:
+        """Small moves (B, V, 3) of posed vertices -> moves in the unposed space that place them there.
+
+        Damped: where opposite turns blend to nothing, no finite move would.
+        """
+        turns = (self.weights @ transforms[:, :, :3, :3].flatten(2)).unflatten(-1, (3, 3))
+        back = turns.transpose(-1, -2)
+        damped = back @ turns + 1e-3 * torch.eye(3).to(turns)
+        return torch.linalg.solve(damped, back @ moved[..., None])[..., 0]
 
     def shaped(self, shape: Tensor) -> Tensor:
         """The template as wide as bodies of shape (B, S): (B, V, 3) [m]."""
