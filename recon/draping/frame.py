@@ -6,7 +6,8 @@ frame of 24 joints, calling their sixty small operations takes twenty times as l
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -17,6 +18,18 @@ wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
 
 DEVICE = "cpu"
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch works in one thread meanwhile: products of one frame are too small to share out, and where another program
+    has the second core, waiting for it takes longer than all of the work."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
 
 
 class FrameRig:

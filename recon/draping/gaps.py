@@ -24,7 +24,7 @@ from recon.cloth.energies import Cloth
 from recon.cloth.projective import Projecting, Projective
 from recon.draping.binding import METHODS, BodyField, cloth_operators
 from recon.draping.dress import held_vertices
-from recon.draping.frame import FrameRig
+from recon.draping.frame import FrameRig, one_thread
 from recon.files.weights import read_weights
 from recon.types import TWO_PANELS, BodyPose, Garment, Mesh, PosedBody, UserError
 
@@ -214,11 +214,12 @@ class GapsDraper:
             if rig is None or not torch.equal(pose.shape, shape):
                 shape, rest = pose.shape, self.bound.shaped(pose.shape)
                 rig = FrameRig(body.rest_joints(shape)[0], body.parents, SPEED, rig)
-            features = rig(pose.pose[0], pose.translation[0], fps).to(rest)[None, None]
-            if hidden is None:
-                hidden = self._warm(features, shape)
-            moved, hidden = self.net(features, shape, hidden)
-            drape = skin(rest + moved[0], rig.transforms.to(rest), self.bound.weights)
+            with one_thread():
+                features = rig(pose.pose[0], pose.translation[0], fps).to(rest)[None, None]
+                if hidden is None:
+                    hidden = self._warm(features, shape)
+                moved, hidden = self.net(features, shape, hidden)
+                drape = skin(rest + moved[0], rig.transforms.to(rest), self.bound.weights)
             yield self.projective(drape, body.pose(pose)) if self.projective else drape
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
