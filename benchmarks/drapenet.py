@@ -210,6 +210,12 @@ def ratios(rows: list[dict], kinds: tuple[str, ...]) -> tuple[dict[str, float], 
     return mean, {w: round(statistics.median(a / b for a, b in zip(strain[w], base, strict=True)), 4) for w in ways_}
 
 
+def learned(part: dict) -> dict[str, float]:
+    """Minutes and steps of a part, with those that it went on from."""
+    before = learned(part["before"]) if "before" in part else {"minutes": 0.0, "steps": 0}
+    return {k: round(part[k] + before[k], 1) for k in before}
+
+
 def decoder_figures(quick: bool) -> dict:
     """The generative network's figures, by its own benchmark, where that is there."""
     try:
@@ -245,7 +251,7 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
         "table1": {"draped": draped, "pairs": over, "ed": ed},
         "kinds": kinds,
         **{"code_ms" if k == "encode_ms" and decoder else k: v for k, v in times(size, body, draper).items()},
-        "trained": {name: {"minutes": p["minutes"], "steps": p["steps"]} for name, p in parts.items()},
+        "trained": {name: learned(p) for name, p in parts.items()},
         "size": vars(size),
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}",
     }
