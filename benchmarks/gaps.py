@@ -61,7 +61,7 @@ def table1(
         still = torch.zeros(len(pose.pose), *draper.bound.rest.shape)
         skinned = draper.bound.place(still, posed.transforms, pose.shape)[lead:][::every]
     shown = Mesh(posed.mesh.vertices[lead:][::every], body.faces)
-    posed = type(posed)(shown, posed.rest, posed.joints, posed.transforms, posed.weights, posed.shape)
+    posed = type(posed)(shown, posed.rest, posed.joints[lead:][::every], posed.transforms, posed.weights, posed.shape)
     part = Moving(draper.garment, x)
     row = {
         "network": measure(part, posed, body),
@@ -296,7 +296,8 @@ def table(title: str, rows: dict[str, dict], untangled: bool) -> list[str]:
 def _errors(figures: dict | None) -> str:
     if figures is None:  # measured before there were steps
         return "-"
-    return f"{figures['eps_e']:.2f}, {figures['eps_a']:.2f}, {figures['eps_c']:.2f} ± {figures['eps_c_std']:.2f}"
+    out = f"; out {figures['limbs_out_pct']:.0f}" if figures.get("limbs_out_pct") else ""
+    return f"{figures['eps_e']:.2f}, {figures['eps_a']:.2f}, {figures['eps_c']:.2f} ± {figures['eps_c_std']:.2f}{out}"
 
 
 def page(found: dict) -> str:
@@ -306,7 +307,11 @@ def page(found: dict) -> str:
     lines += [f"{about} Clip: {CLIP.stem}, which no network learned from."]
     lines += ["Cells: eps_e, eps_a, eps_c ± its deviation over the frames, in per cent. *With steps*: the network's"]
     lines += ["drapes after projective steps (`recon.cloth.projective`: nothing learned, no state from frame to"]
-    lines += ["frame), which is what `recon animate` gives; they use the body's mesh."]
+    lines += [
+        "frame), which is what `recon animate` gives; they use the body's mesh. *Out*: frames in which a limb has"
+    ]
+    lines += ["left an opening of the garment (an arm its sleeve), in per cent; none where nothing is said. Limbs that"]
+    lines += ["pass through the body in the clip are turned out of it first (`recon.bodies.clearance`)."]
     lines += table("Table 1: the neutral body", found["table1"], True)
     if "baselines" in found:
         lines += table("Baselines in the same frame, as many steps each", found["baselines"], False)

@@ -29,6 +29,7 @@ from recon.cloth.untangle import Untangling, untangle
 from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping.dress import limits_of
 from recon.draping.gaps import load_gaps
+from recon.draping.openings import Openings
 from recon.draping.skinning import SkinningDraper
 from recon.files.animations import Moving, write_animated_glb, write_film, write_obj_sequence, write_pc2
 from recon.files.atomic import write_whole
@@ -121,7 +122,8 @@ def animate(config: Animate, say: Callable[[str], None] = print) -> Animated:
         job = lambda _, name=name: drape(name, config, body, pose, posed, worn)  # noqa: E731
         thing, frames = run.stage(f"drape-{_file_name(name)}", job, config=[config.draper, config.steps])
         worn.insert(0, Moving(thing, frames, layer_colour(k)))
-    posed = replace(posed, mesh=posed.mesh.with_vertices(posed.mesh.vertices[LEAD_IN:]))
+    shown = posed.mesh.with_vertices(posed.mesh.vertices[LEAD_IN:])
+    posed = replace(posed, mesh=shown, joints=posed.joints[LEAD_IN:])
     worn = [replace(part, frames=part.frames[LEAD_IN:]) for part in worn]
     figures: dict = {"garments": {}, "notes": list(motion.notes), "frames": len(motion.pose), "fps": config.fps}
     if config.untangle:
@@ -269,10 +271,13 @@ def untangled(
 
 
 def measure(part: Moving, posed: PosedBody, body: Body) -> dict[str, float]:
-    """GAPS' figures of one garment over the motion."""
+    """GAPS' figures of one garment over the motion, and the limbs that left its openings [% of the frames]."""
     inside = [BodyContact(b, body.faces).penetrating(x) for b, x in zip(posed.mesh.vertices, part.frames, strict=True)]
     rest = part.thing.mesh if isinstance(part.thing, Garment) else part.thing
-    return {k: round(v, 4) for k, v in drape_errors(rest, part.frames, torch.stack(inside)).items()}
+    figures = {k: round(v, 4) for k, v in drape_errors(rest, part.frames, torch.stack(inside)).items()}
+    openings = Openings.of(rest.vertices, rest.faces, body.rest_joints(body.neutral().shape)[0])
+    left = openings.left(part.frames, posed.joints)
+    return figures | {"limbs_out_pct": round(100 * max(left.values(), default=0.0), 1)}
 
 
 def write(parts: dict[str, Moving], config: Animate) -> None:
