@@ -1,7 +1,8 @@
 """Which limbs go through which of a garment's openings: an arm that has left its sleeve is worse than any stretch.
 
-Lengths, areas and contact do not tell: cloth that a limb has passed through lies outside of it, unstretched. Each border
-is spanned by triangles around its middle; a chain of bones that crosses them an odd number of times goes through.
+Lengths, areas and contact do not tell: cloth that a limb has passed through lies outside of it, unstretched. Each
+border is spanned by triangles around its middle; a chain of bones that crosses them an odd number of times goes
+through.
 """
 
 from __future__ import annotations
