@@ -25,6 +25,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import platform
 import statistics
 import time
@@ -253,6 +254,7 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
         **{"code_ms" if k == "encode_ms" and decoder else k: v for k, v in times(size, body, draper).items()},
         "trained": {name: learned(p) for name, p in parts.items()},
         "size": vars(size),
+        "load": round(os.getloadavg()[0], 1),
         "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}",
     }
 
@@ -288,7 +290,9 @@ def page(found: dict) -> str:
         for group, ways_ in found["table1"]["ed"].items():
             lines += [f"| {group} | {way} | {f['ed_mm']:.1f} |" for way, f in ways_.items()]
     lines += ["", "## Times", "", f"Drape, everything anew: {found['drape_ms']} ms; garment made ready before: "]
-    lines[-1] += f"{found['drape_ready_ms']} ms."
+    lines[-1] += (
+        f"{found['drape_ready_ms']} ms. Load of the machine then: {found['load']} (two cores; above 2 it is too slow)."
+    )
     return "\n".join(lines) + "\n"
 
 

@@ -61,8 +61,11 @@ def mlp(inputs: int, width: int, depth: int, outputs: int, last: float = 1.0) ->
     return nn.Sequential(*layers, out)
 
 
-def quickly(net: nn.Sequential, x: Tensor) -> Tensor:
-    """An ``mlp`` at (N, C) points without gradient, its inner layers in half precision where that is faster."""
+def quickly(net: nn.Sequential, x: Tensor, fine: bool = True) -> Tensor:
+    """An ``mlp`` at (N, C) points without gradient, its inner layers in half precision where that is faster.
+
+    ``fine``: the last one in full; else in halves too.
+    """
     first, *inner, last = (layer for layer in net if isinstance(layer, nn.Linear))
     halves = torch.bfloat16 if halves_are_fast(x.device) and x.dtype == torch.float32 else x.dtype
     hidden = [(layer.weight.to(halves), layer.bias.to(halves)) for layer in inner]
@@ -71,8 +74,11 @@ def quickly(net: nn.Sequential, x: Tensor) -> Tensor:
         h = F.silu(first(part), inplace=True).to(halves)
         for k, (weight, bias) in enumerate(hidden, 1):
             h = F.linear(h, weight, bias)
-            h = F.silu(h if k < len(hidden) else h.to(x.dtype), inplace=True)
-        torch.addmm(last.bias, h.to(x.dtype), last.weight.T, out=rows)
+            h = F.silu(h.to(x.dtype) if fine and k == len(hidden) else h, inplace=True)
+        if fine:
+            torch.addmm(last.bias, h.to(x.dtype), last.weight.T, out=rows)
+        else:
+            rows.copy_(F.linear(h, last.weight.to(halves), last.bias.to(halves)))
     return out
 
 
@@ -133,7 +139,7 @@ class Displacements(nn.Module):
         """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]; ``quick``: see :func:`quickly`."""
         seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
         seen = torch.cat([seen, code.expand(len(x), -1)], 1)
-        out = quickly(self.maps, seen) if quick else self.maps(seen)
+        out = quickly(self.maps, seen, fine=False) if quick else self.maps(seen)
         return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1).contiguous()
 
     def embedding(self, body: PosedBody) -> Tensor:
