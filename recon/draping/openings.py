@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon.bodies.rig import JOINT_NAMES
-from recon.files.patterns import border_loops
+from recon.garments.panels import border_loops
 
 CHAINS = {
     "left arm": ("l_collar", "l_shoulder", "l_elbow", "l_wrist"),

@@ -149,11 +149,6 @@ def _border(faces: NDArray[np.int64]) -> NDArray[np.int64]:
     return edges[count[which.ravel()] == 1]
 
 
-def border_loops(faces: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """The open borders of a mesh (F, 3), each the vertices (N,) along it."""
-    return _loops(_border(faces))
-
-
 def _components(faces: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """(n,) number of the connected piece that each point belongs to."""
     from scipy.sparse import coo_matrix
