@@ -233,6 +233,8 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
     how, keys = ways(draper, skinning), ("b2g_pct", *TERMS, "total")
     draped, over, kinds, ratio, typical = {}, {}, {}, {}, {}
     for case, clear in CASES.items():
+        if quick and not clear:
+            continue
         rows = alone(size, body, how, clear)
         draped[case] = {g: means([r for r in rows if r["kind"] in kinds_], keys) for g, kinds_ in GROUPS.items()}
         kinds[case] = {k: means([r for r in rows if r["kind"] == k], keys) for v in GROUPS.values() for k in v}
@@ -245,10 +247,11 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
         decoder = decoder_figures(quick)
     return {
         **decoder,
-        "b2g_pct": {c: {g: t["drapenet"]["b2g_pct"] for g, t in table.items()} for c, table in draped.items()},
-        "g2g_pct": {c: {way: found["g2g_pct"] for way, found in ways_.items()} for c, ways_ in over.items()},
-        "strain_ratio": {c: dict(zip(GROUPS, r, strict=True)) for c, r in ratio.items()},
-        "strain_ratio_median": {c: dict(zip(GROUPS, r, strict=True)) for c, r in typical.items()},
+        "b2g_pct": {g: t["drapenet"]["b2g_pct"] for g, t in draped["cleared"].items()},
+        "g2g_pct": {way: found["g2g_pct"] for way, found in over["cleared"].items()},
+        "strain_ratio": dict(zip(GROUPS, ratio["cleared"], strict=True)),
+        "strain_ratios": {c: dict(zip(GROUPS, r, strict=True)) for c, r in ratio.items()},
+        "strain_ratio_medians": {c: dict(zip(GROUPS, r, strict=True)) for c, r in typical.items()},
         "table1": {"draped": draped, "pairs": over, "ed": ed},
         "kinds": kinds,
         **{"code_ms" if k == "encode_ms" and decoder else k: v for k, v in times(size, body, draper).items()},
@@ -277,9 +280,9 @@ def page(found: dict) -> str:
     lines += ["", "Paper: B2G 0.9 (tops), 0.3 (bottoms); strain 0.43 and 0.41 J, total 1.81 and 1.28 J.", ""]
     lines += ["Strain to skinning's, of the means and in the median over drapes:", ""]
     lines += ["| poses | garments | way | of means | median |", "|---|---|---|---|---|"]
-    for case, of_means in found["strain_ratio"].items():
+    for case, of_means in found["strain_ratios"].items():
         for group, by_way in of_means.items():
-            middle = found["strain_ratio_median"][case][group]
+            middle = found["strain_ratio_medians"][case][group]
             lines += [f"| {case} | {group} | {w} | {r:.2f} | {middle[w]:.2f} |" for w, r in by_way.items()]
     lines += ["", "## Top over bottom", "", "| poses | way | G2G % | bottom's B2G % |", "|---|---|---|---|"]
     for case, ways_ in found["table1"]["pairs"].items():

@@ -85,8 +85,7 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
         pose[:half] = frames[torch.randint(len(frames), (half,), generator=generator)]
     shape = torch.randn(count, body.n_shape, generator=generator).clamp(-2, 2)
     bodies = BodyPose(shape, pose, torch.zeros(count, 3))
-    with torch.enable_grad():
-        return clear_bodies(bodies, body) if clear else bodies
+    return clear_bodies(bodies, body) if clear else bodies
 
 
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:

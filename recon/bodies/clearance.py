@@ -154,6 +154,7 @@ class Clearance:
         near = self.balls.near(centres, gap)
         return pose.new_zeros(len(pose)).scatter_reduce(0, near[0], self.balls.depth(centres, near, gap), "amax")
 
+    @torch.enable_grad()
     def cleared(self, pose: Tensor, motion: bool = False) -> Tensor:
         """(B, 24, 3) the poses, limbs turned out of the body; those that were clear come back as they are.
 
