@@ -28,8 +28,8 @@ from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
 from recon.draping.dress import held_vertices
-from recon.draping.gaps import Bound, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
-from recon.files.weights import write_weights
+from recon.draping.gaps import Bound, GapsDraper, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
+from recon.files.weights import read_manifest, write_weights
 from recon.garments.panels import border_loops
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
 
@@ -88,7 +88,8 @@ class TrainGaps:
     margin: float = 0.003
     """Distance from the body at which collision begins [m]."""
     start: Path | None = None
-    """Folder with weights of this name and garment that make drapes to learn from; None takes the shipped ones."""
+    """Folder with weights of this name and garment to go on from; None begins anew, and takes the shipped ones where
+    they make ``drapes`` to learn from."""
     drapes: int = 0
     """Learn from so many windows of drapes (a network's, after projective steps) instead of from physics."""
     teaching: Teaching = Teaching()
@@ -147,17 +148,25 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
     torch.manual_seed(config.seed)
     shape = GapsShape(len(template.mesh.vertices), body.n_shape, config.width, config.layers)
     net = GapsNet(shape, smooth_basis(template.mesh.vertices, template.mesh.faces, config.modes))
+    if config.start:
+        known = _known(template, body, config).net
+        if known.shape != shape:
+            raise UserError(f"{config.start}: found a network of {known.shape}; wanted {shape}")
+        net.take_over(known)
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
     training = Training(f"gaps-{config.name}", net, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     loss = Loss(template, motions, body, config)
-    training.run(Budget(config.minutes, config.steps), lambda share: loss(net, share, generator))
+    # What was learned once has its schedule of stretch behind it.
+    training.run(
+        Budget(config.minutes, config.steps), lambda share: loss(net, 1.0 if config.start else share, generator)
+    )
     return training
 
 
-def learn_drapes(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
-    """Training on drapes of a network that is there.
+def _known(template: Template, body: Body, config: TrainGaps) -> GapsDraper:
+    """The draper that is there.
 
     Raises:
         UserError: no such network, or one of another garment.
@@ -166,6 +175,16 @@ def learn_drapes(template: Template, motions: list[Motion], body: Body, config: 
     mesh = draper.garment.mesh if isinstance(draper.garment, Garment) else draper.garment
     if not torch.equal(mesh.faces, template.mesh.faces):
         raise UserError(f"gaps-{config.name}: found a network of another garment than {config.garment}")
+    return draper
+
+
+def learn_drapes(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
+    """Training on drapes of a network that is there.
+
+    Raises:
+        UserError: no such network, or one of another garment.
+    """
+    draper = _known(template, body, config)
     kept = config.out / f"gaps-{config.name}.drapes"
     known = drapes(draper, motions, body, config.drapes, config.teaching, kept)
     edges = Edges(template.mesh)
@@ -259,6 +278,9 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
     }
     if config.drapes:
         card["taught"] = f"by {config.drapes} windows of drapes of the network before it, after projective steps"
+    if config.start:
+        before = read_manifest(config.start)[f"gaps-{config.name}"]
+        card["before"] = {k: before[k] for k in ("seed", "steps", "minutes", "machine", "before") if k in before}
     if isinstance(thing, Garment):
         names = ("panel_points", "panel_faces", "panel_of_face", "vertex_of_point", "border_labels")
         tensors |= {f"garment.{name}": getattr(thing, name) for name in names}

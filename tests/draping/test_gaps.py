@@ -225,3 +225,14 @@ def test_a_folder_of_something_else_is_left_alone(trained, motions, tmp_path) ->
     with pytest.raises(UserError, match="no run wrote"):
         animate(Animate(("mini",), motions / "march.npz", tmp_path, weights=trained[0]), say=lambda line: None)
     assert "schema" in (tmp_path / "result.json").read_text()
+
+
+def test_a_network_goes_on_from_stored_weights(body, garment) -> None:
+    mesh = garment.mesh
+    basis = smooth_basis(mesh.vertices, mesh.faces, 20)
+    shape = GapsShape(len(mesh.vertices), body.n_shape, 16, 2)
+    first, second = GapsNet(shape, basis), GapsNet(shape, basis)
+    second.take_over(first.folded())
+    features = torch.randn(2, 3, first.gru.input_size - body.n_shape)
+    betas = torch.randn(2, body.n_shape)
+    assert torch.allclose(first(features, betas)[0], second(features, betas)[0], atol=1e-6)
