@@ -2,7 +2,7 @@
 
 Lengths, areas and contact do not tell: cloth that a limb has passed through lies outside of it, unstretched. Each
 border is spanned by triangles around its middle; a chain of bones that crosses them an odd number of times goes
-through.
+through. A border that lies at a sharply bent elbow may be misjudged: there the chain passes close by its edge.
 """
 
 from __future__ import annotations
