@@ -71,7 +71,7 @@ class Size:
     """Timings."""
 
 
-FULL, QUICK = Size(10, 4, 10, 2, 9), Size(1, 2, 2, 0, 3)
+FULL, QUICK = Size(10, 4, 10, 2, 9), Size(1, 1, 2, 0, 3)
 
 
 def ways(draper: DrapeNetDraper, skinning: SkinningDraper) -> dict[str, Callable[[Garment, PosedBody], Mesh]]:

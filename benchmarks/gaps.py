@@ -202,7 +202,7 @@ def quick(folder: Path | None) -> dict:
             for way, title in (("network", ""), ("projected", "_steps")):
                 for key in ("c", "e", "a"):
                     row[f"eps_{key}_pct{title}"][name] = found[way][f"eps_{key}"]
-    row["ms_per_frame"] = time_per_frame(body, 60, repeats=3)["one_by_one"]
+    row["ms_per_frame"] = time_per_frame(body, 40, repeats=3)["one_by_one"]
     tangles = list(run_tangles(4, seed=1, family="unfitting"))
     row["untangled_share"] = sum(not t["pairs_left"] and not t["inside"] for t in tangles) / len(tangles)
     coarse, fine = hanging_square(20), hanging_square(30)
@@ -217,7 +217,7 @@ def networks(folder: Path | None, names: list[str], body: Body, motion: Motion, 
         found[name] = table1(name, folder, body, motion, 3, draw_apart=False)
         if every:
             found[name]["untangled"] = table1(name, folder, body, motion, every)["untangled"]
-        found[name]["card"] = {k: cards[f"gaps-{name}"][k] for k in ("steps", "minutes", "skinning")}
+        found[name]["card"] = {k: cards[f"gaps-{name}"][k] for k in ("steps", "minutes", "skinning", "data")}
         print(name, found[name]["network"], flush=True)
     return found
 
@@ -316,6 +316,8 @@ def page(found: dict) -> str:
     if "baselines" in found:
         lines += table("Baselines in the same frame, as many steps each", found["baselines"], False)
         lines += ["", "snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility."]
+        data = sorted({row["card"]["data"] for row in found["baselines"].values()})
+        lines += [f"Learned from: {'; '.join(data)}."]
     lines += [
         "",
         "## Table 3: other bodies",

@@ -27,8 +27,9 @@ from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, res
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
 
-FARTHEST = 3.0
-"""Garments further from the learned ones than so many deviations count as if they were there."""
+FARTHEST = 1.0
+"""Garments further from the learned ones' mean than so many deviations (root mean square of the components) count as if
+they were there: beyond, the network guesses (a wide jacket strained to six times skinning's)."""
 KEPT = 4
 """So many garments stay prepared."""
 
@@ -106,7 +107,8 @@ class DisplacementNet(nn.Module):
     def code(self, garment: Garment) -> Tensor:
         """(code,) what the network knows of a garment; differentiable in its vertices and panels."""
         found = rest_features(garment, self.shape.box, self.shape.cells).to(self.mean) - self.mean
-        return (found @ self.components).clamp(-FARTHEST, FARTHEST)
+        code = found @ self.components
+        return code * (FARTHEST / code.square().mean().clamp_min(1e-12).sqrt()).clamp(max=1.0)
 
     def forward(self, transforms: Tensor, shape: Tensor, code: Tensor) -> Tensor:
         """Joints (B, 24, 4, 4), shapes (B, S), code (code,) -> displacement maps (B, 3, 2, nx, ny) [m], front and back.
