@@ -33,6 +33,7 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth
 from recon.cloth.projective import Projecting, Projective
 from recon.cloth.rest import Resting, rest
+from recon.cloth.untangle import Untangling
 from recon.draping.gaps import Bound, GapsDraper, GapsNet, GapsShape, load_gaps
 from recon.files.animations import Moving
 from recon.files.motions import read_clip
@@ -256,6 +257,7 @@ def tangles(cases: int, kept: Path | None) -> dict:
             print(row, flush=True)
         clean = [r for r in rows if not r["pairs_left"] and not r["inside"]]
         found[family] = {
+            "tries": Untangling.tries,
             "cases": len(rows),
             "clean": len(clean),
             "judged_clean": sum(bool(r["judged_clean"]) for r in rows),
@@ -361,9 +363,10 @@ def page(found: dict) -> str:
     lines += ["## Untangling", ""]
     for family, u in found["tangles"].items():
         lines += [
-            f"- {family}: {u['clean']} of {u['cases']} random tangles end clean (by ipctk's judgement nothing "
-            f"crosses in {u['judged_clean']}); {u['cpu_seconds_per_pair_median']} s of one core per pair in the "
-            f"median, {u['cpu_seconds_per_pair_max']} s at most; edges change by {u['strain_pct_median']} % "
+            f"- {family}: {u['clean']} of {u['cases']} random tangles end clean, in {u['tries']} tries at most "
+            f"(by ipctk's judgement nothing crosses in {u['judged_clean']}); "
+            f"{u['cpu_seconds_per_pair_median']} s of one core per pair in the median, "
+            f"{u['cpu_seconds_per_pair_max']} s at most; edges change by {u['strain_pct_median']} % "
             f"({u['strain_pct_max']} % at most), vertices move {u['moved_mean_mm_median']:.2f} mm on average."
         ]
     return "\n".join(lines) + "\n"

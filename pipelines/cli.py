@@ -74,9 +74,11 @@ def _show_animation(animate: Callable[..., Any], config: Any) -> int:
     """Drape with a line a stage on stderr; the figures and where the results lie on stdout."""
     result = animate(config, say=lambda line: print(line, file=sys.stderr))
     for name, found in result.figures["garments"].items():
+        out = found["limbs_out_pct"]
+        note = f", a limb out of its opening in {out:.0f} % of frames" if out else ""
         print(
             f"{name}: edges {found['eps_e']:.2f} %, areas {found['eps_a']:.2f} % off the template, "
-            f"{found['eps_c']:.3f} % of vertices inside the body"
+            f"{found['eps_c']:.3f} % of vertices inside the body{note}"
         )
     print(f"{result.folder}   ({result.figures['frames']} frames, {result.figures['seconds']:.0f} s)")
     return OK

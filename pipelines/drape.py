@@ -27,6 +27,7 @@ from recon.cloth.untangle import Untangled, untangle
 from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.isp import IspDraper
 from recon.draping.layering import Beneath, Layering, load_layering
+from recon.draping.openings import Openings
 from recon.draping.projected import ANY_POSE, ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.atomic import write_whole
@@ -245,16 +246,19 @@ _PANELLED = "a garment as KIND:CODE"
 def measure(
     names: Sequence[str], things: Sequence[Garment | Mesh], layers: Sequence[Mesh], posed: PosedBody, body: Body
 ) -> dict[str, dict]:
-    """Figures of each garment, innermost first."""
+    """Figures of each garment, innermost first; ``limbs_out``: limbs that left an opening of theirs."""
     contact = BodyContact(posed.mesh.vertices[0], body.faces)
     beneath = [Beneath.of(m.vertices, m.faces) for m in layers]
     figures: dict[str, dict] = {}
     for k, (name, thing, mesh) in enumerate(zip(names, things, layers, strict=True)):
+        rest = thing.mesh if isinstance(thing, Garment) else thing
+        out = Openings.worn_by(body, rest).left(mesh.vertices[None], posed.joints)
         found = {
             "vertices": len(mesh.vertices),
             "inside_body_pct": round(inside_pct(mesh, contact), 4),
             "vertices_inside_body": int(contact.penetrating(mesh.vertices).sum()),
             "self_intersections": len(self_intersections(mesh.vertices, mesh.faces)),
+            "limbs_out": [limb for limb, share in out.items() if share],
             "beneath_pct": {names[j]: round(beneath_pct(mesh, beneath[j]), 4) for j in range(k)},
         }
         if isinstance(thing, Garment):

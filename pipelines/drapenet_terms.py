@@ -46,7 +46,7 @@ class Covered:
         """From both garments at rest on the neutral body."""
         rest = body.rest(body.neutral().shape).vertices[0]
         tried = body.region_mask("torso", "legs").nonzero().flatten()
-        normal = _normals(rest, body.faces)[tried]
+        normal = vertex_normals(rest, body.faces)[tried]
         over, chosen = [], torch.ones(len(tried), dtype=torch.bool)
         for mesh in (top, bottom):
             x = mesh.vertices.detach()
@@ -56,12 +56,6 @@ class Covered:
             chosen &= (torch.as_tensor(distance[:, 0]) < COVERED) & ((away * normal).sum(1) > OVER)
             over.append(at)
         return cls(tried[chosen], over[0][chosen], over[1][chosen])
-
-
-def _normals(x: Tensor, faces: Tensor) -> Tensor:
-    a, b, c = x[faces].unbind(1)
-    normal = torch.linalg.cross(b - a, c - a).repeat_interleave(3, 0)
-    return torch.nn.functional.normalize(torch.zeros_like(x).index_add(0, faces.reshape(-1), normal), dim=1)
 
 
 def nearest(points: Tensor, x: Tensor, over: Tensor) -> Tensor:

@@ -275,8 +275,7 @@ def measure(part: Moving, posed: PosedBody, body: Body) -> dict[str, float]:
     inside = [BodyContact(b, body.faces).penetrating(x) for b, x in zip(posed.mesh.vertices, part.frames, strict=True)]
     rest = part.thing.mesh if isinstance(part.thing, Garment) else part.thing
     figures = {k: round(v, 4) for k, v in drape_errors(rest, part.frames, torch.stack(inside)).items()}
-    openings = Openings.of(rest.vertices, rest.faces, body.rest_joints(body.neutral().shape)[0])
-    left = openings.left(part.frames, posed.joints)
+    left = Openings.worn_by(body, rest).left(part.frames, posed.joints)
     return figures | {"limbs_out_pct": round(100 * max(left.values(), default=0.0), 1)}
 
 

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from recon.bodies import Body
 from recon.bodies.rig import JOINT_NAMES
 from recon.garments.panels import border_loops
+from recon.types import Mesh
 
 CHAINS = {
     "left arm": ("l_collar", "l_shoulder", "l_elbow", "l_wrist"),
@@ -62,6 +64,11 @@ class Openings:
                 if passes(rest[border][None], chain[None]):
                     found.append((limb, border))
         return cls(tuple(found))
+
+    @classmethod
+    def worn_by(cls, body: Body, rest: Mesh) -> Openings:
+        """Of a garment at rest on the neutral body."""
+        return cls.of(rest.vertices, rest.faces, body.rest_joints(body.neutral().shape)[0])
 
     def left(self, x: Tensor, joints: Tensor) -> dict[str, float]:
         """Limb -> share of the B drapes (B, V, 3) on joints (B, 24, 3) in which it has left an opening of its own."""

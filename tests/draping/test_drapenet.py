@@ -16,9 +16,9 @@ from recon.draping.drapenet import (
     group_of,
     load_drapenet,
     under_top,
-    waves,
     widened,
 )
+from recon.draping.mlp import waves
 from recon.files.weights import write_weights
 from recon.garments.dataset import load_garments
 from recon.types import BodyPose, Mesh, UserError
