@@ -177,6 +177,7 @@ def sources_table(rows: dict[str, list[dict]]) -> str:
                 continue
             line = [kind, source, str(len(found)), f"{mean(found, 'surface_mm'):.2f}"]
             line += [f"{mean(again, 'surface_mm'):.2f}" if again else "", f"{100 * mean(found, 'normals'):.1f}"]
+            line += [f"{100 * mean(again, 'normals'):.1f}" if again else ""]
             line += [f"{100 * mean(found, 'panel_iou'):.2f}", f"{100 * mean(found, 'labels'):.1f}"]
             line += [f"{mean(found, 'seam_gap_mm'):.2f}", f"{100 * mean(found, 'openings'):.0f}"]
             lines.append([*line, f"{statistics.median(row['seconds'] for row in found):.0f}"])
@@ -187,6 +188,7 @@ def sources_table(rows: dict[str, list[dict]]) -> str:
         "mm",
         "floor mm",
         "NC %",
+        "floor NC %",
         "panel IoU %",
         "labels %",
         "gap mm",
