@@ -19,6 +19,8 @@ from recon.types import UserError
 
 SAVE_EVERY = 60.0
 """Training seconds between checkpoints."""
+LOG_EVERY = 100
+"""Steps from one line of the log to the next."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,19 @@ def settings_of(config: Any, free: Collection[str] = (), **more: Any) -> str:
     """What a checkpoint must agree with: all settings but ``FREE`` and ``free``, and ``more``."""
     kept = {k: str(v) for k, v in asdict(config).items() if k not in (*FREE, *free)}
     return json.dumps({**kept, **more}, sort_keys=True)
+
+
+def curve(log: Path, points: int = 8) -> list[dict[str, float]]:
+    """What is learned against time: evenly spaced lines of a log's last training, seconds as minutes; [] = no log."""
+    lines = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
+    begun = max((k for k, line in enumerate(lines) if line["step"] == LOG_EVERY), default=0)
+    lines = list({line["step"]: line for line in lines[begun:]}.values())  # a resumed training says some steps twice
+    chosen = sorted({round((k + 1) * len(lines) / points) - 1 for k in range(points)} - {-1})
+    return [
+        {"minutes": round(lines[k]["seconds"] / 60, 1)}
+        | {name: float(f"{v:.3g}") for name, v in lines[k].items() if name not in ("step", "seconds")}
+        for k in chosen
+    ]
 
 
 @dataclass
@@ -63,6 +78,11 @@ class Training:
         """The checkpoint's file."""
         return self.out / f"{self.name}.checkpoint"
 
+    @property
+    def log(self) -> Path:
+        """The log's file: a line each ``LOG_EVERY`` steps."""
+        return self.out / f"{self.name}.log.jsonl"
+
     def card(self, config: Any) -> dict[str, Any]:
         """What the card of every network says of its training; folders of this machine stay out of it."""
         told = {k: str(v) for k, v in asdict(config).items() if v is not None and not isinstance(v, Path)}
@@ -72,6 +92,7 @@ class Training:
             "steps": self.step,
             "minutes": round(self.seconds / 60, 1),
             "machine": f"{platform.machine()} CPU, {config.threads} threads, torch {torch.__version__}",
+            "curve": curve(self.log),
         }
 
     def save(self) -> None:
@@ -107,7 +128,7 @@ class Training:
         rates = [group.setdefault("first_lr", group["lr"]) for group in self.optimizer.param_groups]
         columns = TextColumn(self.name), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
         saved, smooth = self.seconds, dict[str, float]()
-        with open(self.out / f"{self.name}.log.jsonl", "a") as log, Progress(*columns) as progress:
+        with open(self.log, "a") as log, Progress(*columns) as progress:
             bar = progress.add_task("train", total=1.0, note="")
             while (share := self._share(budget)) < 1:
                 begun = time.perf_counter()
@@ -118,7 +139,7 @@ class Training:
                 self.step += 1
                 self.seconds += time.perf_counter() - begun
                 smooth = {k: 0.97 * smooth.get(k, v) + 0.03 * v for k, v in terms.items()}
-                if self.step % 100 == 0:
+                if self.step % LOG_EVERY == 0:
                     line = {"step": self.step, "seconds": round(self.seconds, 1), **smooth}
                     log.write(json.dumps(line) + "\n")
                     log.flush()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from pipelines.training import Budget, Training
+from pipelines.training import Budget, Training, curve
 from recon.types import UserError
 
 
@@ -35,6 +35,9 @@ def test_it_learns_logs_and_cleans_up(tmp_path: Path) -> None:
     rows = [json.loads(row) for row in (tmp_path / "line.log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [100, 200, 300] and rows[-1]["off"] < rows[0]["off"]
     assert not training.checkpoint.exists()
+    told = curve(training.log, 2)
+    assert [row["off"] for row in told] == [float(f"{rows[k]['off']:.3g}") for k in (1, 2)]
+    assert set(told[0]) == {"minutes", "off", "share"}
 
 
 def test_the_clock_is_a_budget_too(tmp_path: Path) -> None:
