@@ -72,8 +72,7 @@ class LayeredCloth:
         for k, part in enumerate(parts):
             pair = close_strangers(part, self.limits[k].rest, self.apart[k])
             found.append(Contacts(pair=pair + self.starts[k], apart=np.full(len(pair), self.apart[k])))
-            for j in range(k + 1, len(parts)):
-                found += [self._over(parts, k, j), self._under(parts, j, k)]
+        found.append(between(parts, self.faces, self.rims, self.starts))
         contacts = Contacts.join(found)
         self.energy.touch(contacts, self.settings)
         depth = ((x[contacts.vertex] - contacts.point) * contacts.normal).sum(1)
@@ -94,9 +93,8 @@ class LayeredCloth:
 
     def _body(self, x: NDArray) -> Contacts:
         """Planes of the body close to the cloth."""
-        _, _, on, away, distance = _closest(self.body, x)
-        near = np.flatnonzero((distance < self.settings.reach) & (distance > 1e-7))
-        return Contacts(vertex=near, point=on[near], normal=away[near] / distance[near, None])
+        close = self.body.nearest(x, self.settings.reach)
+        return Contacts(vertex=close.rows, point=close.point, normal=close.outward)
 
     def _holds(self):
         """Two facing planes hold each waistband vertex at its height, and leave it its way around the body."""
@@ -105,22 +103,26 @@ class LayeredCloth:
                 normal = np.tile([0.0, direction, 0.0], (len(level), 1))
                 yield Contacts(vertex=limits.held + start, point=level - self.settings.offset * normal, normal=normal)
 
-    def _over(self, parts: list[NDArray], k: int, j: int) -> Contacts:
-        """Vertices of layer k near layer j beneath it: they stay outside of its faces."""
-        surface = BodyContact(torch.tensor(parts[j]), self.faces[j])
-        corners, weights, _, away, distance = _closest(surface, parts[k])
-        near = (distance < LAYER_REACH) & (distance > 1e-7)
-        near &= ~(self.rims[j][corners] | (weights < ON_BORDER)).all(1)  # beside an open border there are no sides
-        chosen = np.flatnonzero(near)
-        over = np.column_stack([chosen + self.starts[k], corners[chosen] + self.starts[j]])
-        return Contacts(over=over, weights=weights[chosen], direction=away[chosen] / distance[chosen, None])
 
-    def _under(self, parts: list[NDArray], k: int, j: int) -> Contacts:
-        """Vertices of layer k near layer j above it that face the same way: they stay inside of its faces."""
-        found = self._over(parts, k, j)
-        own = vertex_normals(parts[k], self.faces[k].numpy())[found.over[:, 0] - self.starts[k]]
-        same = (own * found.direction).sum(1) > SAME_WAY
-        return Contacts(over=found.over[same], weights=found.weights[same], direction=-found.direction[same])
+def between(parts: Sequence[NDArray], faces: Sequence[Tensor], rims: Sequence[NDArray], starts: NDArray) -> Contacts:
+    """Contacts of layers (V, 3), outermost first: of vertices over the layers beneath, and under those above.
+
+    ``faces`` (F, 3) and ``rims`` (V,) bool of each, ``starts``: the first of its vertices among all.
+    """
+    found = []
+    for k in range(len(parts)):
+        for j in range(k + 1, len(parts)):
+            for mine, other, side in ((k, j, 1.0), (j, k, -1.0)):
+                surface = BodyContact(torch.tensor(parts[other]), faces[other])
+                close = surface.nearest(parts[mine], LAYER_REACH)
+                # Beside an open border there are no sides.
+                fit = ~(rims[other][close.corners] | (close.weights < ON_BORDER)).all(1)
+                if side < 0:  # beneath is only what faces the same way
+                    own = vertex_normals(parts[mine], faces[mine].numpy())[close.rows]
+                    fit &= (own * close.outward).sum(1) > SAME_WAY
+                pair = np.column_stack([close.rows + starts[mine], close.corners + starts[other]])[fit]
+                found.append(Contacts(over=pair, weights=close.weights[fit], direction=side * close.outward[fit]))
+    return Contacts.join(found or [Contacts()])
 
 
 def stack(cloths: Sequence[Cloth]) -> Cloth:
@@ -134,12 +136,3 @@ def stack(cloths: Sequence[Cloth]) -> Cloth:
     plain = ("inverse", "areas", "edge_lengths", "hinge_weights", "masses", "rest_angles")
     same = {name: joined(name) for name in plain}
     return Cloth(**moved, **same, fabric=cloths[0].fabric)
-
-
-def _closest(surface: BodyContact, x: NDArray) -> tuple[NDArray, ...]:
-    """For points (V, 3): corners and weights (V, 3) of the closest point, the point, the way from it to its outside."""
-    face, weights, sign = (t.numpy() for t in surface.closest(torch.from_numpy(x)))
-    corners = surface.faces.numpy()[face]
-    on = (surface.vertices.numpy()[corners] * weights[..., None]).sum(1)
-    away = (x - on) * sign[:, None]
-    return corners, weights, on, away, np.linalg.norm(away, axis=1)

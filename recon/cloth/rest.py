@@ -1,23 +1,35 @@
 """Cloth at rest: the minimum of elastic energy, gravity and contact, reached to a stated residual force.
 
-L-BFGS on the compiled energy, started in the metric of springs along the edges (``solve.springs``); contact with the
-body is searched anew every few steps, and when nothing moves any more it is searched once again before that counts.
+L-BFGS on the compiled energy, in the metric of a positive stand-in for its Hessian (``curvature``); that and contacts
+(``touch``) are made anew every few steps, and when nothing moves any more contacts are searched once again before that
+counts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from recon.cloth.contact import BodyContact
+from recon.cloth.curvature import Curvature
 from recon.cloth.energies import GRAVITY, Cloth
-from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, edge_laplacian, lbfgs, springs
+from recon.cloth.layers import stack
+from recon.cloth.solve import Contacts, ElasticEnergy, PolishSettings, lbfgs
+from recon.cloth.touch import Touch
 
 FEWEST = 5
 """Steps between two searches for contact at least."""
+LONGEST = 0.02
+"""No vertex moves further in one step [m]."""
+BACK = 6
+"""So many times in a row a round is taken back because energy would rise; the next one counts whatever it does."""
+MANY = 1.7
+"""Where a step takes more evaluations than this, springs are made stiffer: directions were too bold."""
+FIRM, FIRMER, LOOSER, LEAST = 0.1, 3.0, 0.3, 1e-5
+"""Stiffness of the springs in the metric, in units of the membrane's: at first, how it changes, and the least."""
 
 
 @dataclass(frozen=True)
@@ -28,14 +40,15 @@ class Resting:
     """Largest residual force on any vertex, in units of the mean vertex's weight."""
     iterations: int = 4000
     """Most steps in all."""
-    search: int = 100
+    search: int = 30
     """Steps between two searches for contact."""
     memory: int = 20
     """Pairs that L-BFGS keeps."""
     friction: float = 0.0
-    """Coulomb's coefficient between cloth and body; cloth sticks where it first touches until that gives way."""
-    contact: PolishSettings = field(default_factory=PolishSettings)
-    """Distance kept from the body, and how stiff that is."""
+    """Coulomb's coefficient, on the body and between layers; cloth sticks where it first touches until that gives
+    way."""
+    contact: PolishSettings = field(default_factory=lambda: PolishSettings(stiffness=20.0))
+    """Distance kept from the body and between layers, and how stiff that is."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +64,14 @@ class Rested:
     iterations: int
     """An upper bound of the steps taken."""
     energies: tuple[float, ...]
-    """Energy at the start and after each search for contact, with the contacts found there [J]; friction, which spends
-    energy, aside."""
+    """Energy at the start and after each search for contact, with the contacts found there and what friction has
+    stored [J]."""
     converged: bool
     """Whether the residual met the tolerance."""
 
 
 def rest(
-    cloth: Cloth,
+    cloth: Cloth | Sequence[Cloth],
     start: NDArray,
     pins: NDArray | None = None,
     body: BodyContact | None = None,
@@ -67,100 +80,62 @@ def rest(
     """Let cloth come to rest.
 
     Args:
-        cloth: in double precision, on the CPU.
-        start: (V, 3) where it is now [m].
+        cloth: in double precision, on the CPU; or several layers of one fabric, outermost first.
+        start: (V, 3) where it is now, layers stacked [m].
         pins: (P,) vertices that stay where they are.
         body: what it may lie on.
         settings: see :class:`Resting`.
     """
-    s = settings or Resting()
-    energy, x = ElasticEnergy(cloth), np.array(start, np.float64)
-    held = np.zeros(0, np.int64) if pins is None else np.asarray(pins)
-    laplacian = edge_laplacian(cloth)
-    weight = GRAVITY * float(cloth.masses.mean())
-    spring = cloth.fabric.thickness * (2 * cloth.fabric.lame_mu + cloth.fabric.lame_lambda)
-
-    def free(x: NDArray) -> tuple[float, NDArray]:
-        value, gradient = energy(x)
-        gradient[held] = 0
-        return value, gradient
-
-    touch = _Touch(energy, body, s, cloth.masses.numpy() * GRAVITY)
-    done, energies, residual, before, steps = 0, list[float](), np.inf, x, s.search
-    while done < s.iterations:
-        touching, spent = touch(x)
-        value, gradient = free(x)
-        if energies and value - spent > energies[-1] and not s.friction and steps > FEWEST:
-            # Planes stand for a curved body only so far: back, and search again after fewer steps.
-            x, steps = before, max(steps // 4, FEWEST)
-            touching, spent = touch(x)
-            value, gradient = free(x)
+    s, x = settings or Resting(), np.array(start, np.float64)
+    scene = _Scene([cloth] if isinstance(cloth, Cloth) else list(cloth), pins, body, s)
+    value, residual = scene.search(x)
+    done, energies, steps, longest, back = 0, [value], s.search, LONGEST, 0
+    while residual > s.tolerance and done < s.iterations:
+        now, found = min(steps, s.iterations - done), (residual, scene.contacts, scene.touch.sticking)
+        new = scene.minimise(x, now, longest)
+        value, residual = scene.search(new)
+        done += now
+        if value > energies[-1] and back < BACK:
+            # Planes stand for a curved body only so far: back, and search again after fewer and shorter steps.
+            back, steps, longest = back + 1, max(steps // 4, FEWEST), longest / 4
+            residual, scene.contacts, scene.touch.sticking = found
         else:
-            energies.append(value - spent)
-        residual = float(np.abs(gradient).max(initial=0.0)) / weight
-        if residual <= s.tolerance:
-            break
-        diagonal = 2 * s.contact.stiffness * touching
-        diagonal[held] = 1e6 * spring
-        solve = springs(cloth, laplacian, diagonal)
-
-        def metric(q: NDArray, solve=solve) -> NDArray:
-            out = solve(q)
-            out[held] = 0
-            return out
-
-        before, now = x, min(steps, s.iterations - done)
-        x = lbfgs(free, x, now, s.memory, metric, longest=0.02, tolerance=s.tolerance * weight)
-        done, steps = done + now, min(2 * steps, s.search)
+            x, back, steps, longest = new, 0, min(2 * steps, s.search), min(2 * longest, LONGEST)
+            energies.append(value)
     return Rested(x, energies[-1], residual, done, tuple(energies), residual <= s.tolerance)
 
 
-class _Touch:
-    """The body's planes near the cloth, searched anew at each call; with friction, what each vertex sticks to."""
+class _Scene:
+    """Layers, what they touch, and the metric to measure steps by."""
 
-    def __init__(self, energy: ElasticEnergy, body: BodyContact | None, settings: Resting, weight: NDArray):
-        """``weight`` (V,) of each vertex [N]."""
-        self.energy, self.body, self.settings, self.weight = energy, body, settings, weight
-        self.anchor = np.full((len(weight), 3), np.nan)
+    def __init__(self, cloths: list[Cloth], pins: NDArray | None, body: BodyContact | None, settings: Resting):
+        whole = stack(cloths)
+        self.settings, self.energy, self.curvature = settings, ElasticEnergy(whole), Curvature(whole)
+        self.touch = Touch(cloths, body, settings.contact, settings.friction)
+        self.held = np.zeros(0, np.int64) if pins is None else np.asarray(pins)
+        self.weight = GRAVITY * float(whole.masses.mean())
+        self.contacts, self.firm, self.evaluations = Contacts(), FIRM, 0
 
-    def __call__(self, x: NDArray) -> tuple[NDArray, float]:
-        """(V,) 1 where cloth at ``x`` (V, 3) touches, and the energy that friction would give back [J]."""
-        s = self.settings.contact
-        touching = np.zeros(len(x))
-        if self.body is None:
-            return touching, 0.0
-        face, weights, sign = (t.numpy() for t in self.body.closest(torch.from_numpy(x)))
-        on = (self.body.vertices.detach().numpy()[self.body.faces.numpy()[face]] * weights[..., None]).sum(1)
-        away = (x - on) * sign[:, None]
-        distance = np.linalg.norm(away, axis=1)
-        near = np.flatnonzero((distance < s.reach) & (distance > 1e-9))
-        normal, depth = away[near] / distance[near, None], s.offset - sign[near] * distance[near]
-        touching[(distance < 1.5 * s.offset) | (sign < 0)] = 1
-        if not self.settings.friction:
-            self.energy.touch(Contacts(vertex=near, point=on[near], normal=normal), s)
-            return touching, 0.0
-        first = np.argsort(depth < -s.slip, kind="stable")  # those that touch come first
-        near, normal, depth = near[first], normal[first], depth[first]
-        stuck = int((depth >= -s.slip).sum())
-        grip, spent = self._stick(x, near[:stuck], normal[:stuck], depth[:stuck])
-        anchor = self.anchor[near[:stuck]]
-        self.energy.touch(Contacts(vertex=near, point=on[near], normal=normal, anchor=anchor, grip=grip), s)
-        return touching, spent
+    def free(self, x: NDArray) -> tuple[float, NDArray]:
+        """Energy and gradient, which is 0 where cloth is pinned."""
+        value, gradient = self.energy(x)
+        self.evaluations += 1
+        gradient[self.held] = 0
+        return value, gradient
 
-    def _stick(self, x: NDArray, vertex: NDArray, normal: NDArray, depth: NDArray) -> tuple[NDArray, float]:
-        """(A,) how hard each touching vertex is held, its anchor dragged along where it slid; friction's energy."""
-        slip = self.settings.contact.slip
-        loose = np.ones(len(x), bool)
-        loose[vertex] = False
-        self.anchor[loose] = np.nan
-        new = vertex[np.isnan(self.anchor[vertex, 0])]
-        self.anchor[new] = x[new]
-        along = x[vertex] - self.anchor[vertex]
-        along -= normal * (along * normal).sum(1, keepdims=True)
-        way = np.linalg.norm(along, axis=1)
-        slid = way > slip
-        self.anchor[vertex[slid]] += along[slid] * (1 - slip / way[slid, None])
-        # What only just arrived is not pressed down yet: it counts with its weight.
-        pressed = np.maximum(2 * self.settings.contact.stiffness * depth, self.weight[vertex] * normal[:, 1].clip(0))
-        grip = self.settings.friction * pressed
-        return grip, float((grip * np.minimum(way, slip) ** 2).sum() / (2 * slip))
+    def search(self, x: NDArray) -> tuple[float, float]:
+        """Find contacts at ``x`` (V, 3); the energy with them [J], and the residual in mean weights."""
+        self.contacts = self.touch(x)
+        self.energy.touch(self.contacts, self.settings.contact)
+        value, gradient = self.free(x)
+        return value, float(np.abs(gradient).max(initial=0.0)) / self.weight
+
+    def minimise(self, x: NDArray, steps: int, longest: float) -> NDArray:
+        """(V, 3) after ``steps``, none longer than ``longest`` [m]."""
+        s = self.settings
+        metric = self.curvature.solve(x, self.contacts, s.contact, self.held, self.firm)
+        self.energy.touch(self.contacts, s.contact)
+        self.evaluations = 0
+        x = lbfgs(self.free, x, steps, s.memory, metric, longest, s.tolerance * self.weight)
+        self.firm = float(np.clip(self.firm * (FIRMER if self.evaluations > MANY * steps else LOOSER), LEAST, 1.0))
+        return x

@@ -64,8 +64,14 @@ class Contacts:
     """(K, 3) a point of each plane [m]."""
     normal: NDArray = _rows(3)
     """(K, 3) unit normals: the side where the vertex belongs."""
+    stuck: NDArray = _rows(4, int)
+    """(A, 4) a vertex that friction holds, and the corners of the cloth's face that it is held to."""
+    share: NDArray = _rows(3)
+    """(A, 3) barycentric weights of the point of that face; zeros: it is held to what never moves."""
     anchor: NDArray = _rows(3)
-    """(A, 3) where friction would hold the first A of those vertices [m]; none: they slide freely."""
+    """(A, 3) where it would be held, from that point on [m]."""
+    across: NDArray = _rows(3)
+    """(A, 3) unit normals: friction acts across them."""
     grip: NDArray = _rows(0)
     """(A,) the most that it holds each with: its coefficient times the normal force [N]."""
     pair: NDArray = _rows(2, int)
@@ -79,6 +85,12 @@ class Contacts:
     direction: NDArray = _rows(3)
     """(O, 3) unit vectors: the side of the face where the vertex belongs."""
 
+    def along(self, x: NDArray) -> NDArray:
+        """(A, 3) how far cloth at ``x`` (V, 3) has slid from where friction would hold it [m]."""
+        held = np.einsum("ak,aki->ai", self.share, x[self.stuck[:, 1:]])
+        way = x[self.stuck[:, 0]] - held - self.anchor
+        return way - self.across * (way * self.across).sum(1, keepdims=True)
+
     @staticmethod
     def join(parts: Sequence[Contacts]) -> Contacts:
         """All contacts of all parts."""
@@ -90,7 +102,10 @@ class _Contacts:
     vertex: wp.array(dtype=int)
     point: wp.array(dtype=wp.vec3d)
     normal: wp.array(dtype=wp.vec3d)
+    stuck: wp.array(dtype=wp.vec4i)
+    share: wp.array(dtype=wp.vec3d)
     anchor: wp.array(dtype=wp.vec3d)
+    across: wp.array(dtype=wp.vec3d)
     grip: wp.array(dtype=wp.float64)
     slip: wp.float64
     pair: wp.array(dtype=wp.vec2i)
@@ -121,17 +136,21 @@ def _evaluate(
         if depth > wp.float64(0.0):
             total += c.stiffness * depth * depth
             g[i] = g[i] - c.normal[k] * (two * c.stiffness * depth)
-    for k in range(c.anchor.shape[0]):
-        i = c.vertex[k]
-        along = x[i] - c.anchor[k]
-        along = along - c.normal[k] * wp.dot(along, c.normal[k])
+    for k in range(c.stuck.shape[0]):
+        o = c.stuck[k]
+        w = c.share[k]
+        along = x[o[0]] - x[o[1]] * w[0] - x[o[2]] * w[1] - x[o[3]] * w[2] - c.anchor[k]
+        along = along - c.across[k] * wp.dot(along, c.across[k])
         way = wp.length(along)
+        pull = along * (c.grip[k] / wp.max(way, c.slip))
         if way < c.slip:
             total += c.grip[k] * way * way / (two * c.slip)
-            g[i] = g[i] + along * (c.grip[k] / c.slip)
         else:
             total += c.grip[k] * (way - wp.float64(0.5) * c.slip)
-            g[i] = g[i] + along * (c.grip[k] / way)
+        g[o[0]] = g[o[0]] + pull
+        g[o[1]] = g[o[1]] - pull * w[0]
+        g[o[2]] = g[o[2]] - pull * w[1]
+        g[o[3]] = g[o[3]] - pull * w[2]
     for k in range(c.pair.shape[0]):
         p = c.pair[k]
         away = x[p[0]] - x[p[1]]
@@ -177,7 +196,9 @@ class ElasticEnergy:
         c = _Contacts()
         c.vertex = wp.array(contacts.vertex.astype(np.int32), dtype=int, device=DEVICE)
         c.point, c.normal = doubles(contacts.point, wp.vec3d), doubles(contacts.normal, wp.vec3d)
-        c.anchor, c.grip = doubles(contacts.anchor, wp.vec3d), doubles(contacts.grip, wp.float64)
+        c.stuck = wp.array(contacts.stuck.astype(np.int32), dtype=wp.vec4i, device=DEVICE)
+        c.share, c.anchor = doubles(contacts.share, wp.vec3d), doubles(contacts.anchor, wp.vec3d)
+        c.across, c.grip = doubles(contacts.across, wp.vec3d), doubles(contacts.grip, wp.float64)
         c.slip = s.slip
         c.pair = wp.array(contacts.pair.astype(np.int32), dtype=wp.vec2i, device=DEVICE)
         c.apart = doubles(contacts.apart, wp.float64)
@@ -198,18 +219,12 @@ def polish(
     cloth: Cloth, start: NDArray, contact: BodyContact, limits: Constraints, settings: PolishSettings | None = None
 ) -> NDArray:
     """(V, 3) positions near ``start`` (V, 3) [m] that minimise the cloth's energy on the body."""
-    import torch
-
     s = settings or PolishSettings()
     energy, x = ElasticEnergy(cloth), np.array(start, np.float64)
     level = held_height(x, limits.held)
     for _ in range(s.rounds):
-        face, weights, sign = (t.numpy() for t in contact.closest(torch.from_numpy(x)))
-        on = (contact.vertices.numpy()[contact.faces.numpy()[face]] * weights[..., None]).sum(1)
-        away = (x - on) * sign[:, None]
-        distance = np.linalg.norm(away, axis=1)
-        near = np.flatnonzero((distance < s.reach) & (distance > 1e-7))
-        planes = Contacts(vertex=near, point=on[near], normal=away[near] / distance[near, None])
+        close = contact.nearest(x, s.reach)
+        planes = Contacts(vertex=close.rows, point=close.point, normal=close.outward)
         pairs = close_strangers(x, limits.rest, s.apart)
         apart = Contacts(pair=pairs, apart=np.full(len(pairs), s.apart))
         energy.touch(Contacts.join([planes, *_holds(x, limits, level, s), apart]), s)
