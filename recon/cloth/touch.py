@@ -95,16 +95,17 @@ class Touch:
 
     def __call__(self, x: NDArray) -> Contacts:
         """Contacts at ``x`` (V, 3), with what friction holds if there is any."""
-        planes = self._planes(x) if self.body is not None else Contacts()
         parts = [x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
         layers = between(parts, self.faces, self.rims, self.starts)
-        found = Contacts.join([planes, layers])
+        found = Contacts.join([self._planes(x), layers])
         if not self.friction:
             return found
         pressed = self._pressed(x, found)
         return self._stick(x, found, pressed[pressed.depth >= -self.settings.slip])
 
     def _planes(self, x: NDArray) -> Contacts:
+        if self.body is None:
+            return Contacts()
         close = self.body.nearest(x, self.settings.reach)
         return Contacts(vertex=close.rows, point=close.point, normal=close.outward)
 
