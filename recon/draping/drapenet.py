@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
-from recon.cloth.contact import BodyContact
 from recon.draping.isp import pose_features
-from recon.draping.mlp import mlp, quickly, silent, waves
+from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
 from recon.draping.nodes import Nodes
+from recon.draping.rest_code import RestCode
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, PosedBody, UserError
@@ -33,13 +33,13 @@ GROUPS: dict[str, tuple[str, ...]] = {"top": ("top", "dress"), "bottom": ("trous
 """Network -> the kinds of garments that it drapes."""
 JOINTS = 24
 CHEST = JOINT_NAMES.index("spine3")
-FARTHEST = 0.15
-"""Distances from the fixed points count up to this [m]."""
 POSE_FEATURES = 23 * 6 + 3
 NODE_WIDTH = 0.0125
 """Distance of the nodes at which a fine mesh asks the networks [m]: draped vertices are 0.3 mm off in the mean."""
 MANY = 20_000
 """Meshes of more vertices than this may be finer than the nodes."""
+FEW = 8
+"""Up to so many bodies a garment is draped at once, and not made ready first."""
 
 
 class BodyFieldNet(nn.Module):
@@ -59,6 +59,18 @@ class BodyFieldNet(nn.Module):
         seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.octaves)
         out = quickly(self.net, seen) if quick else self.net(seen)
         return out[:, :JOINTS].softmax(1), 0.01 * out[:, JOINTS:].unflatten(1, (3, -1))
+
+    def on(self, x: Tensor, shape: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) points, shapes (B, S) -> weights (N, 24) and dx (N, B, 3) [m], quickly; see ``Displacements.on``."""
+        *inner, (weight, bias) = layers_of(self.net)
+        by_joint, shift = weight[:JOINTS], bias[:JOINTS]
+        weight, bias = (
+            0.01 * torch.einsum("bs,csw->bcw", shape, t[JOINTS:].view(3, shape.shape[1], -1)).flatten(0, 1)
+            for t in (weight, bias[:, None])
+        )
+        last = torch.cat([by_joint, weight]), torch.cat([shift, bias[:, 0]])
+        out = quickly([*inner, last], waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.octaves))
+        return out[:, :JOINTS].softmax(1), out[:, JOINTS:].unflatten(1, (-1, 3))
 
 
 @dataclass(frozen=True)
@@ -93,9 +105,24 @@ class Displacements(nn.Module):
     def matrix(self, x: Tensor, code: Tensor, quick: bool = False) -> Tensor:
         """M: (N, 3) points and a code (z,) -> (N_B, N, 3) [m]; ``quick``: see :func:`quickly`."""
         seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
-        seen = torch.cat([seen, code.expand(len(x), -1)], 1)
-        out = quickly(self.maps, seen, fine=False) if quick else self.maps(seen)
+        if quick:
+            first, *rest = layers_of(self.maps)
+            out = quickly([with_known(first, code), *rest], seen, fine=False)
+        else:
+            out = self.maps(torch.cat([seen, code.expand(len(x), -1)], 1))
         return self.shape.scale * out.unflatten(1, (self.shape.terms, 3)).transpose(0, 1).contiguous()
+
+    def on(self, x: Tensor, code: Tensor, body: PosedBody) -> Tensor:
+        """dx_ref of (N, 3) points on B bodies -> (N, B, 3) [m], quickly and without gradient.
+
+        B M is linear in what M's last layer gives, so for few bodies the embedding goes into that layer first: it then
+        has 3 B outputs and not 3 N_B.
+        """
+        first, *inner, ends = layers_of(self.maps)
+        embedding = self.shape.scale * self.embedding(body)
+        weight, bias = ((embedding @ t.view(self.shape.terms, -1)).view(3 * len(embedding), -1) for t in ends)
+        seen = waves(x - x.new_tensor([0.0, 1.0, 0.0]), self.shape.octaves)
+        return quickly([with_known(first, code), *inner, (weight, bias[:, 0])], seen).unflatten(1, (-1, 3))
 
     def embedding(self, body: PosedBody) -> Tensor:
         """B: (B, N_B) of posed bodies."""
@@ -104,44 +131,6 @@ class Displacements(nn.Module):
     def forward(self, matrix: Tensor, body: PosedBody) -> Tensor:
         """(N_B, N, 3) of :meth:`matrix` -> displacements (B, N, 3) [m]."""
         return (self.embedding(body) @ matrix.flatten(1)).unflatten(1, (-1, 3))
-
-
-class RestCode(nn.Module):
-    """z: unsigned distances of a garment at rest from fixed points, in the learned garments' principal components."""
-
-    points: Tensor
-    mean: Tensor
-    components: Tensor
-
-    def __init__(self, points: int = 256, size: int = 32):
-        super().__init__()
-        self.register_buffer("points", torch.zeros(points, 3))
-        self.register_buffer("mean", torch.zeros(points))
-        self.register_buffer("components", torch.zeros(size, points))
-
-    def distances(self, mesh: Mesh) -> Tensor:
-        """(P,) how far each fixed point is from the surface, up to ``FARTHEST`` [m]; no gradient."""
-        x = mesh.vertices.detach()
-        with torch.no_grad():
-            return BodyContact(x, mesh.faces).signed_distance(self.points).abs().clamp(max=FARTHEST)
-
-    def know(self, meshes: Sequence[Mesh], generator: torch.Generator) -> None:
-        """Choose points on the meshes and a little off them, and the components of their distances."""
-        everything = torch.cat([m.vertices.detach() for m in meshes])
-        chosen = torch.randperm(len(everything), generator=generator)[: len(self.points)]
-        noise = 0.03 * torch.randn(len(self.points), 3, generator=generator)
-        self.points.copy_(everything[chosen] + noise)
-        rows = torch.stack([self.distances(m) for m in meshes])
-        self.mean.copy_(rows.mean(0))
-        _, spread, axes = torch.linalg.svd(rows - self.mean, full_matrices=False)
-        size = min(len(self.components), len(axes))
-        deviation = spread[:size].clamp_min(1e-6) / len(rows) ** 0.5
-        self.components.zero_()
-        self.components[:size] = axes[:size] / deviation.clamp_min(0.05 * deviation[0])[:, None]
-
-    def forward(self, mesh: Mesh) -> Tensor:
-        """(z,) the code of a mesh at rest on the neutral body, about one in each component; clamped to three."""
-        return (self.components @ (self.distances(mesh) - self.mean)).clamp(-3, 3)
 
 
 @dataclass(frozen=True)
@@ -192,6 +181,18 @@ def between(nodes: Nodes | None, values: Tensor) -> Tensor:
 
 Bound = tuple[Tensor, Tensor]
 """Skinning weights (N, 24) and shape directions (N, 3, S) [m] of a garment's vertices."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is asked of a garment's mesh before the networks are."""
+
+    bound: Bound | None
+    """None: the learned field's."""
+    code: Tensor
+    """(z,)."""
+    above: Tensor | None = None
+    """(z,) code of the garment over it, for the solver."""
 
 
 class DrapeNets(nn.Module):
@@ -250,6 +251,31 @@ class DrapeNets(nn.Module):
         solved = None if above is None else self.solver.matrix(at, torch.cat([above, code]), quick)
         return Prepared(x, weights, directions, matrix, code, solved, nodes, shape_nodes)
 
+    def draped(self, mesh: Mesh, group: str, body: PosedBody, known: Known) -> Tensor:
+        """A mesh at rest on B bodies -> (B, N, 3): what ``prepare``, ``moved`` and ``place`` give.
+
+        For few bodies (``FEW``), where nobody asks for gradients and ``exact`` is not set, shape and pose are folded
+        into the networks, which are asked as ``prepare`` says: sooner, and the same up to roundings (0.1 mm).
+        """
+        x, above = mesh.vertices, known.above
+        if self.exact or len(body.shape) > FEW or not silent(self, x, known.code, body.shape, body.transforms):
+            ready = self.prepare(mesh, group, known.bound, above, known.code)
+            return ready.place(ready.moved(self, group, body), body)
+        nodes = Nodes.around(x, NODE_WIDTH) if len(x) > MANY else None
+        at = x if nodes is None else nodes.at
+        moved = self.displacements(group).on(at, known.code, body)
+        if above is not None:
+            moved += self.solver.on(at, torch.cat([above, known.code]), body)
+        if known.bound is None:
+            weights, by_shape = self.field.on(at, body.shape)
+            moved += by_shape
+            weights = weights if nodes is None else nodes(weights)
+        moved = (moved if nodes is None else nodes(moved.flatten(1)).view(len(x), -1, 3)).transpose(0, 1)
+        if known.bound is None:
+            return skin(x + moved, body.transforms, weights)
+        weights, directions = known.bound
+        return skin(shaped(x, directions, body.shape) + moved, body.transforms, weights)
+
 
 def widened(nets: DrapeNets, terms: int) -> DrapeNets:
     """Networks that drape as these do, with more terms N_B to learn in; the new ones' maps start at zero."""
@@ -279,7 +305,7 @@ class DrapeNetDraper:
         self.nets = nets.eval().requires_grad_(False)
         self.skinning = SkinningDraper(body)
         self.chest = float(body.rest_joints(body.neutral().shape)[0, CHEST, 1])
-        self._last: tuple[Tensor, str, Prepared] | None = None
+        self._last: tuple[Tensor, Known] | None = None
 
     def group(self, garment: Garment) -> str:
         """The network that drapes a garment: by its kind, or for a bare mesh by whether it reaches the chest."""
@@ -287,31 +313,26 @@ class DrapeNetDraper:
             return group_of(garment.kind)
         return "top" if float(garment.mesh.vertices.detach()[:, 1].max()) > self.chest else "bottom"
 
-    def bound(self, mesh: Mesh) -> Bound | None:
-        """Skinning of a mesh as the networks learned it; None = the learned field's."""
-        return self.nets.bound(mesh, self.skinning)
-
-    def prepared(self, garment: Garment) -> Prepared:
-        """The garment made ready; the last one is remembered where no gradient is asked for."""
-        rest, group = garment.mesh, self.group(garment)
-        if rest.vertices.requires_grad and torch.is_grad_enabled():
-            return self.nets.prepare(rest, group, self.bound(rest))
-        if self._last is None or self._last[0] is not rest.vertices or self._last[1] != group:
-            self._last = rest.vertices, group, self.nets.prepare(rest, group, self.bound(rest))
-        return self._last[2]
+    def known(self, mesh: Mesh) -> Known:
+        """Skinning of a mesh as the networks learned it, and its code; of the last mesh they are remembered."""
+        if mesh.vertices.requires_grad and torch.is_grad_enabled():
+            return Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh))
+        if self._last is None or self._last[0] is not mesh.vertices:
+            self._last = mesh.vertices, Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh))
+        return self._last[1]
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
         """The garment on B bodies: Mesh with (B, N, 3) vertices; the layers beneath play no part (see ``outfit``)."""
-        ready = self.prepared(garment)
-        moved = ready.moved(self.nets, self.group(garment), body)
-        return Mesh(ready.place(moved, body), garment.mesh.faces)
+        return self._draped(garment, body, self.known(garment.mesh))
 
     def outfit(self, top: Garment, bottom: Garment, body: PosedBody) -> tuple[Mesh, Mesh]:
         """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9)."""
-        group, above = self.group(bottom), self.prepared(top).code
-        ready = self.nets.prepare(bottom.mesh, group, self.bound(bottom.mesh), above)
-        lower = ready.place(ready.moved(self.nets, group, body), body)
-        return self.drape(top, body), Mesh(lower, bottom.mesh.faces)
+        over, beneath = self.known(top.mesh), self.known(bottom.mesh)
+        lower = self._draped(bottom, body, replace(beneath, above=over.code))
+        return self._draped(top, body, over), lower
+
+    def _draped(self, garment: Garment, body: PosedBody, known: Known) -> Mesh:
+        return Mesh(self.nets.draped(garment.mesh, self.group(garment), body, known), garment.mesh.faces)
 
 
 def load_drapenet(body, folder: str | Path | None = None) -> DrapeNetDraper:

@@ -28,24 +28,40 @@ def mlp(inputs: int, width: int, depth: int, outputs: int, last: float = 1.0) ->
     return nn.Sequential(*layers, out)
 
 
-def quickly(net: nn.Sequential, x: Tensor, fine: bool = True) -> Tensor:
-    """An ``mlp`` at (N, C) points without gradient, its inner layers in half precision where that is faster.
+Linear = tuple[Tensor, Tensor]
+"""Weight (out, in) and bias (out,) of a layer."""
+
+
+def layers_of(net: nn.Sequential) -> list[Linear]:
+    """The linear layers of an ``mlp``."""
+    return [(layer.weight, layer.bias) for layer in net if isinstance(layer, nn.Linear)]
+
+
+def with_known(layer: Linear, known: Tensor) -> Linear:
+    """A layer whose last inputs are the same (K,) at every point, those folded into its bias."""
+    weight, bias = layer
+    free = weight.shape[1] - len(known)
+    return weight[:, :free], torch.addmv(bias, weight[:, free:], known)
+
+
+def quickly(net: nn.Sequential | list[Linear], x: Tensor, fine: bool = True) -> Tensor:
+    """An ``mlp``, or its layers, at (N, C) points without gradient, inner layers in halves where that is faster.
 
     ``fine``: the last one in full; else in halves too.
     """
-    first, *inner, last = (layer for layer in net if isinstance(layer, nn.Linear))
+    (first, shift), *inner, (last, add) = layers_of(net) if isinstance(net, nn.Sequential) else net
     halves = torch.bfloat16 if halves_are_fast(x.device) and x.dtype == torch.float32 else x.dtype
-    hidden = [(layer.weight.to(halves), layer.bias.to(halves)) for layer in inner]
-    out = x.new_empty(len(x), last.out_features)
+    hidden = [(weight.to(halves), bias.to(halves)) for weight, bias in inner]
+    out = x.new_empty(len(x), len(add))
     for rows, part in zip(out.split(CHUNK), x.split(CHUNK), strict=True):
-        h = F.silu(first(part), inplace=True).to(halves)
+        h = F.silu(F.linear(part, first, shift), inplace=True).to(halves)
         for k, (weight, bias) in enumerate(hidden, 1):
             h = F.linear(h, weight, bias)
             h = F.silu(h.to(x.dtype) if fine and k == len(hidden) else h, inplace=True)
         if fine:
-            torch.addmm(last.bias, h.to(x.dtype), last.weight.T, out=rows)
+            torch.addmm(add, h.to(x.dtype), last.T, out=rows)
         else:
-            rows.copy_(F.linear(h, last.weight.to(halves), last.bias.to(halves)))
+            rows.copy_(F.linear(h, last.to(halves), add.to(halves)))
     return out
 
 

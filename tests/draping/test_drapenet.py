@@ -12,13 +12,14 @@ from recon.draping.drapenet import (
     DrapeNetDraper,
     DrapeNets,
     DrapeShape,
-    RestCode,
+    Known,
     group_of,
     load_drapenet,
     under_top,
     widened,
 )
 from recon.draping.mlp import waves
+from recon.draping.rest_code import RestCode
 from recon.files.weights import write_weights
 from recon.garments.dataset import load_garments
 from recon.types import BodyPose, Mesh, UserError
@@ -85,6 +86,24 @@ def test_the_quick_way_agrees_with_each_vertex_in_full(kind):
             assert (ready.nodes is not None) == (len(mesh.vertices) == 30_000 and not exact)
         off = (drapes[0] - drapes[1]).norm(dim=-1)
         assert off.mean() < 4e-4 and off.flatten().quantile(0.99) < 3e-3 and off.max() < 0.02
+
+
+@pytest.mark.parametrize("settled", [True, False])
+@pytest.mark.parametrize("batch", [1, 3])
+def test_folded_into_the_networks_bodies_drape_as_garments_made_ready(settled, batch):
+    """Shipped networks with the solver: what the last layers say for given bodies, and the products of Eq. 6."""
+    draper, body = load_drapenet(BODY), posed(batch)
+    nets, mesh = draper.nets, TROUSERS[1].mesh
+    bound = draper.skinning.bind(mesh.vertices, mesh.faces) if settled else None
+    known = Known(bound, nets.code(mesh), nets.code(TOPS[1].mesh))
+    quick = nets.draped(mesh, "bottom", body, known)
+    nets.exact = True
+    full = nets.draped(mesh, "bottom", body, known)
+    assert quick.shape == (batch, len(mesh.vertices), 3)
+    off = (quick - full).norm(dim=-1)
+    assert off.mean() < 4e-4 and off.max() < 5e-3
+    alone = nets.draped(mesh, "bottom", body, replace(known, above=None))
+    assert (full - alone).norm(dim=-1).mean() > 2 * off.mean()
 
 
 def test_asked_for_gradients_networks_are_asked_in_full(nets):
