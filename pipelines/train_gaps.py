@@ -1,24 +1,23 @@
 """Train GAPS for one garment, self-supervised by physics: ``recon train gaps --garment top:test:7 --motions FOLDER``.
 
-With ``--drapes N`` it goes on from a network that is there, by N windows of that network's own drapes after projective
-steps (:mod:`pipelines.gaps_drapes`): still no simulation, and a fraction of the time.
-
 Windows of motion, random shapes: the network's drapes are pulled towards rest by strain, bending, gravity, collision,
 inertia and the collision-aware inextensibility (GAPS Eq. 9-17). No simulated drapes are needed. The paper's baselines
 run in the same frame: SNUG's is ``--skinning nearest --inextensibility 0``, NCS' ``--skinning smoothed
---inextensibility 0``.
+--inextensibility 0``. At the end the last layer is fitted to the network's own drapes after projective steps
+(:mod:`pipelines.gaps_refit`; ``--teaching.windows 0``: it is not).
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from pipelines.drape_training import ARMS, CLIP_TERMS, HELD_OUT, read_motions
-from pipelines.gaps_drapes import DrapeLoss, Edges, Teaching, drapes, pupil
+from pipelines.gaps_drapes import Teaching
+from pipelines.gaps_refit import taught
 from pipelines.garment_source import load_garment
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
@@ -88,12 +87,9 @@ class TrainGaps:
     margin: float = 0.003
     """Distance from the body at which collision begins [m]."""
     start: Path | None = None
-    """Folder with weights of this name and garment to go on from; None begins anew, and takes the shipped ones where
-    they make ``drapes`` to learn from."""
-    drapes: int = 0
-    """Learn from so many windows of drapes (a network's, after projective steps) instead of from physics."""
+    """Folder with weights of this name and garment to go on from; None begins anew."""
     teaching: Teaching = Teaching()
-    """How drapes are made and learned from."""
+    """How the last layer learns from the network's own drapes at the end."""
     pin: float = 20.0
     """Stiffness that keeps a waistband where skinning has it [J/m² per vertex]."""
 
@@ -138,9 +134,17 @@ def train_gaps(config: TrainGaps) -> Path:
     template = Template.of(load_garment(config.garment), body)
     if not border_loops(template.mesh.faces.numpy()):
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")
-    training = (learn_drapes if config.drapes else learn)(template, motions, body, config)
+    training = learn(template, motions, body, config)
     assert isinstance(training.module, GapsNet)
-    return store(training.module.folded(), template, body, config, training)
+    net = training.module.folded()
+    if config.teaching.windows:
+        training.save()  # a run that is killed while it drapes need not learn again
+        bound = Bound.of(template.mesh.vertices, template.mesh.faces, body, config.skinning)
+        draper = GapsDraper(net, template.thing, bound)
+        net = taught(draper, motions, body, config.teaching, config.out / f"gaps-{config.name}.drapes")
+    file = store(net, template, body, config, training)
+    training.checkpoint.unlink(missing_ok=True)
+    return file
 
 
 def learn(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
@@ -150,7 +154,7 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
     net = GapsNet(shape, smooth_basis(template.mesh.vertices, template.mesh.faces, config.modes))
     if config.start:
         known = _known(template, body, config).net
-        if known.shape != shape:
+        if replace(known.shape, rank=0) != shape:
             raise UserError(f"{config.start}: found a network of {known.shape}; wanted {shape}")
         net.take_over(known)
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
@@ -176,26 +180,6 @@ def _known(template: Template, body: Body, config: TrainGaps) -> GapsDraper:
     if not torch.equal(mesh.faces, template.mesh.faces):
         raise UserError(f"gaps-{config.name}: found a network of another garment than {config.garment}")
     return draper
-
-
-def learn_drapes(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
-    """Training on drapes of a network that is there.
-
-    Raises:
-        UserError: no such network, or one of another garment.
-    """
-    draper = _known(template, body, config)
-    kept = config.out / f"gaps-{config.name}.drapes"
-    known = drapes(draper, motions, body, config.drapes, config.teaching, kept)
-    edges = Edges(template.mesh)
-    net = pupil(draper.net, known, edges, config.teaching, config.seed)
-    adam = torch.optim.Adam([p for p in net.parameters() if p.requires_grad], config.teaching.rate, fused=True)
-    training = Training(f"gaps-{config.name}", net, adam, settings_of(config), config.out)
-    training.resume()
-    generator = torch.Generator().manual_seed(config.seed + training.step)
-    loss = DrapeLoss(known, edges, draper.bound, body, config.teaching)
-    training.run(Budget(config.minutes, config.steps), lambda _: loss(net, generator))
-    return training
 
 
 class Loss:
@@ -276,8 +260,6 @@ def store(net: GapsNet, template: Template, body: Body, config: TrainGaps, done:
         **done.card(config),
         "licence": CLIP_TERMS,
     }
-    if config.drapes:
-        card["taught"] = f"by {config.drapes} windows of drapes of the network before it, after projective steps"
     if config.start:
         before = read_manifest(config.start)[f"gaps-{config.name}"]
         card["before"] = {k: before[k] for k in ("seed", "steps", "minutes", "machine", "before") if k in before}

@@ -28,7 +28,7 @@ class Budget:
     """How long a training lasts."""
 
     minutes: float
-    """Training time."""
+    """Training time; 0 = none, without ``steps``."""
     steps: int = 0
     """So many steps instead; 0 = by the clock."""
 
@@ -152,7 +152,9 @@ class Training:
         self.checkpoint.unlink(missing_ok=True)
 
     def _share(self, budget: Budget) -> float:
-        return self.step / budget.steps if budget.steps else self.seconds / (60 * budget.minutes)
+        if budget.steps or not budget.minutes:
+            return self.step / budget.steps if budget.steps else 1.0
+        return self.seconds / (60 * budget.minutes)
 
     def _descend(self, loss: torch.Tensor, terms: dict[str, float]) -> dict[str, float]:
         """One step; a loss that is no number changes nothing."""

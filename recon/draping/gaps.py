@@ -87,12 +87,16 @@ class GapsNet(nn.Module):
 
     @torch.no_grad()
     def take_over(self, folded: GapsNet) -> None:
-        """Become the function of a network without a basis and few drapes, as near as this one's basis comes to it."""
+        """Become the function of a network without a basis, as near as this one's basis comes to it; of any drapes."""
         self.gru.load_state_dict(folded.gru.state_dict())
+        weight, bias = folded.out.weight.detach(), folded.out.bias.detach()
+        if isinstance(folded.few, nn.Linear):
+            weight, bias = weight @ folded.few.weight, bias + weight @ folded.few.bias
         if self.basis is None:
-            self.out.load_state_dict(folded.out.state_dict())
+            self.out.weight.copy_(weight)
+            self.out.bias.copy_(bias)
             return
-        columns = torch.cat([folded.out.weight, folded.out.bias[:, None]], 1).unflatten(0, (-1, 3)).flatten(1)
+        columns = torch.cat([weight, bias[:, None]], 1).unflatten(0, (-1, 3)).flatten(1)
         found = torch.linalg.lstsq(self.basis, columns).solution.unflatten(1, (3, -1)).flatten(0, 1)
         self.out.weight.copy_(found[:, :-1])
         self.out.bias.copy_(found[:, -1])
