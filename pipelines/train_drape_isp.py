@@ -101,7 +101,7 @@ def train_drape_isp(config: TrainDrapeIsp) -> Path:
     loss = Loss(config, body)
     net = loss.net
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"drape-isp-{config.kind}", net, adam, settings_of(config), config.out)
+    training = Training(f"drape-isp-{config.kind}", net, adam, settings_of(config, ("teaching",)), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     training.run(Budget(config.minutes, config.steps), lambda share: loss(generator))

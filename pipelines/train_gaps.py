@@ -158,7 +158,7 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
             raise UserError(f"{config.start}: found a network of {known.shape}; wanted {shape}")
         net.take_over(known)
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"gaps-{config.name}", net, adam, settings_of(config), config.out)
+    training = Training(f"gaps-{config.name}", net, adam, settings_of(config, ("teaching",)), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     loss = Loss(template, motions, body, config)
