@@ -119,7 +119,7 @@ class Loss:
     def __init__(self, config: TrainDrapeIsp, body: Body):
         """Decodes and binds the garments: half a minute."""
         self.config, self.body = config, body
-        motions = read_motions(config.motions, config.holdout, body, 30.0)
+        motions = read_motions(config.motions, config.holdout, body, 30.0, config.out)
         clearance = Clearance(body, body.neutral().shape)
         self.sampler = BodySampler(motions, body.n_shape, Sampling(shape_spread=config.shape_spread), clearance)
         weights = FrameWeights(collision=config.collision, margin=config.margin, inextensibility=0.0, deep_share=3)

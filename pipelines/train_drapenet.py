@@ -188,7 +188,7 @@ class DrapeLoss:
     def __init__(self, config: TrainDrapenet, body: Body, nets: DrapeNets):
         """Decodes the garments and makes them ready: some seconds each."""
         self.config, self.body, self.nets = config, body, nets
-        motions = read_motions(config.motions, config.holdout, body, 30.0)
+        motions = read_motions(config.motions, config.holdout, body, 30.0, config.out)
         sampling = Sampling(shape_spread=config.shape_spread, pool=config.cleared)
         clearance = Clearance(body, body.neutral().shape, Clearing(gap=CLEAR)) if config.cleared else None
         self.sampler = BodySampler(motions, body.n_shape, sampling, clearance)

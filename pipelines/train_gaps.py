@@ -130,7 +130,7 @@ def train_gaps(config: TrainGaps) -> Path:
     if config.skinning not in METHODS:
         raise UserError(f"--skinning: found {config.skinning!r}; wanted one of {', '.join(METHODS)}")
     body = load_body()
-    motions = read_motions(config.motions, config.holdout, body, config.fps)
+    motions = read_motions(config.motions, config.holdout, body, config.fps, config.out)
     template = Template.of(load_garment(config.garment), body)
     if not border_loops(template.mesh.faces.numpy()):
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")

@@ -101,7 +101,7 @@ class Loss:
     def __init__(self, config: TrainLayersIsp, body: Body):
         """Decodes, binds and rasters the garments: half a minute."""
         self.config, self.body = config, body
-        motions = read_motions(config.motions, config.holdout, body, 30.0)
+        motions = read_motions(config.motions, config.holdout, body, 30.0, config.out)
         clearance = Clearance(body, body.neutral().shape)
         self.sampler = BodySampler(motions, body.n_shape, clearance=clearance)
         self.draper = load_isp_draper(body, config.weights)

@@ -137,9 +137,13 @@ def test_the_same_seed_learns_the_same(trained, tmp_path) -> None:
     assert again.read_bytes() == (out / "gaps-mini.safetensors").read_bytes()
 
 
-def test_held_out_clips_are_not_learned_from(motions, body) -> None:
+def test_held_out_clips_are_not_learned_from(motions, body, tmp_path) -> None:
     config = TrainGaps("skirt:test:1", motions, holdout=("march",))
-    assert len(read_motions(config.motions, config.holdout, body, config.fps)) == 2  # one clip and its mirror image
+    first = read_motions(config.motions, config.holdout, body, config.fps, tmp_path)
+    assert len(first) == 2  # one clip and its mirror image
+    assert len(list((tmp_path / "clips").iterdir())) == 1
+    again = read_motions(config.motions, config.holdout, body, config.fps, tmp_path)
+    assert torch.equal(again[0].pose, first[0].pose) and torch.equal(again[0].translation, first[0].translation)
     with pytest.raises(UserError, match="no motion clips"):
         read_motions(config.motions, ("march", "stroll"), body, config.fps)
 
