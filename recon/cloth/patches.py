@@ -62,15 +62,22 @@ def border_numbers(rim: NDArray, vertices: int) -> NDArray:
     return loops
 
 
-def film(x: NDArray, edges: NDArray, rim: NDArray, free: NDArray[np.bool_]) -> NDArray:
+def film(
+    x: NDArray, edges: NDArray, rim: NDArray, free: NDArray[np.bool_], drawn: NDArray[np.bool_] | None = None
+) -> NDArray:
     """``x`` (V, 3) with the ``free`` vertices laid like a soap film across the held ones.
 
-    Open borders (``rim``, (R, 2) edges) would be drawn in: they are only smoothed, along themselves.
+    Open borders (``rim``, (R, 2) edges) would be drawn in: they are only smoothed, along themselves. Where ``drawn``
+    (V,) says so they are, and lie straight between the parts of the same border that are not.
     """
     out, on_rim = x.copy(), np.zeros(len(x), bool)
     on_rim[rim] = True
+    straight = np.zeros(len(x), bool) if drawn is None else free & drawn & on_rim
+    loops = border_numbers(rim, len(x))
+    straight &= np.isin(loops, loops[on_rim & ~straight])  # something of that border must be left
+    out = laid_across(out, rim, straight)
     ends = np.concatenate([rim, rim[:, ::-1]])
-    ends = ends[free[ends[:, 0]]]
+    ends = ends[(free & ~straight)[ends[:, 0]]]
     chosen, which, count = np.unique(ends[:, 0], return_inverse=True, return_counts=True)
     for _ in range(RIM_SMOOTHING if len(chosen) else 0):
         middle = np.zeros((len(chosen), 3))

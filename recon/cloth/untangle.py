@@ -14,6 +14,11 @@ crosses, in wider ones each time, like soap films (``patches``): films over one 
 their borders, and those are clean. That always costs more strain than was needed, so once all is clean cloth goes back
 to its lengths and its place, by steps that cross nothing (``tighten``).
 
+What stays tangled is tried in other ways, from the start. One is for wide cloth under narrow: the sides of a wide shirt
+stand out of a narrow dress over it along curves that end at the hem, so they cut nothing off. What has outgrown the
+layer over it, where the body that it is worn on lies under that layer too, is laid flat, border and all. Every other
+round then moves layers so that curves grow shorter: beside an armhole cloth leaves by the border.
+
 Only what is tangled, and what hangs on it, moves.
 """
 
@@ -37,6 +42,8 @@ PATIENCE = 3
 """So many rounds without much progress, then cloth is laid flat."""
 HELD = 0.1
 """How easily cloth gives way that is not laid flat, compared with what is."""
+ALONE = 3
+"""So many times what has outgrown the layers over it is laid flat by itself, where there is any."""
 RADIUS, WIDER, WIDEST = 0.04, 1.5, 0.2
 """Radius of the first balls whose cloth is laid flat, how many times wider the next are, and the widest [m]."""
 LEAVING = 20
@@ -44,8 +51,9 @@ LEAVING = 20
 FARTHEST = 0.1
 """Where little else helps layers are recognised this deep in each other [m]."""
 
-WAYS: tuple[dict[str, float], ...] = (
+WAYS: tuple[dict[str, float | bool], ...] = (
     {},
+    {"tuck": True},
     {"stiffness": 0.2},
     {"curve": 0.3, "gap": 2e-3},
     {"reach": 0.04},
@@ -59,7 +67,7 @@ class Untangling:
 
     rounds: int = 30
     """Most rounds of each try; what ends clean mostly does in fewer."""
-    tries: int = 4
+    tries: int = 5
     """Most tries, each from the start and in another of the ``WAYS``."""
     body: float = 5e-4
     """Distance from the body that every vertex and face centre ends with [m]."""
@@ -69,6 +77,8 @@ class Untangling:
     """Layers deeper in each other than this are not recognised [m]."""
     curve: float = 0.6
     """Longest step against the curve of self-intersection per round, in mean edge lengths."""
+    tuck: bool = False
+    """Whether cloth too wide for the layers over it is drawn in beneath them."""
     sweeps: int = 4
     """Sweeps per round over the edges near a repair."""
     stiffness: float = 0.5
@@ -132,11 +142,14 @@ class _Tangle:
         self.crossings = Crossings(self.faces, len(self.x))
         self.edges = self.crossings.edges
         self.lengths = np.linalg.norm(self.x[self.edges[:, 0]] - self.x[self.edges[:, 1]], axis=1)
-        self.repairs = Repairs(self.crossings, self.starts, settings.gap, float(self.lengths.mean()))
+        self.body = Escape(body, self.x, self.faces, self.edges) if body is not None else None
+        worn_on = self.body.body if self.body else None
+        self.repairs = Repairs(self.crossings, self.starts, settings.gap, float(self.lengths.mean()), worn_on)
+        self.repairs.tucked = settings.tuck
         self.layer = self.repairs.layer
         self.pockets = Pockets(self.crossings, self.x, self.layer)
         self.flat = 0  # times that cloth was laid flat
-        self.body = Escape(body, self.x, self.faces, self.edges) if body is not None else None
+        self.balls = 0  # times that all was, in balls around what crosses
         self.tighten = Tighten(self.repairs, self.body, settings.body, Tightening(rounds=settings.tighten))
 
     def solve(self) -> Untangled:
@@ -189,25 +202,30 @@ class _Tangle:
             moved |= self.repairs.own_side(self.x, found, min(s.reach * (1 + self.flat), FARTHEST))
             found = self.crossings(self.x, self.repairs.around(self.x, found, 0.06))
         if len(found):
-            moved |= self.repairs.apart(self.x, found, s.curve, number)
+            ordered = not (s.tuck and self.flat) or number % 2 == 0
+            moved |= self.repairs.apart(self.x, found, s.curve, number, ordered)
         # Where layers leave the body together, the outer ones go further, else they would all end in one place.
         moved |= self._leave_body(number, 3, s.gap * (self.layer.max() - self.layer))
         self._relax(moved)
         self._leave_body(number, 10)
 
     def _lay_flat(self, found: NDArray) -> None:
-        """Pockets, later balls around all that crosses, are laid flat; from now on mostly they give way."""
+        """Pockets and what has outgrown the layers over it, later balls around all that crosses, are laid flat; from
+        now on mostly they give way."""
         if not len(found):
             return
-        if self.flat:
-            free = self.repairs.around(self.x, found, min(RADIUS * WIDER ** (self.flat - 1), WIDEST))
-        else:
+        drawn = self.repairs.outgrown(self.x, found, WIDEST) if self.settings.tuck else np.zeros(len(self.x), bool)
+        free = drawn.copy()
+        if not self.flat:
             crossing = np.zeros(len(self.edges), bool)
             crossing[found[:, 0]] = True
-            free = self.pockets.find(crossing)
+            free |= self.pockets.find(crossing)
+        elif self.flat > ALONE or not free.any():
+            free |= self.repairs.around(self.x, found, min(RADIUS * WIDER**self.balls, WIDEST))
+            self.balls += 1
         self.flat += 1
         self.repairs.yields = np.where(free, 1.0, HELD)
-        self.x = film(self.x, self.edges, self.crossings.rim, free)
+        self.x = film(self.x, self.edges, self.crossings.rim, free, drawn)
         mine = free[self.edges].any(1)
         ends = self.x[self.edges[mine]]
         self.lengths[mine] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)

@@ -121,3 +121,29 @@ def test_it_says_where_it_could_not() -> None:
     done = untangle(meshes, BODY, Untangling(rounds=0))
     assert not done.clean and len(done.left) == done.crossings > 0
     assert "layers 0 and 1" in done.notes[0] and "pairs of faces" in done.notes[0]
+
+
+def tube(width: float, depth: float, height: float, around: int = 48, along: int = 16) -> Mesh:
+    """An upright elliptic tube about the y axis, open at both ends; half its ``width`` along x, ``depth`` along z."""
+    turn, up = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, height, along))
+    x = np.stack([width * np.sin(turn), up - height / 2, depth * np.cos(turn)], -1).reshape(-1, 3)
+    i, j = (n.ravel() for n in np.meshgrid(np.arange(along - 1), np.arange(around), indexing="ij"))
+    a, b = i * around + j, i * around + (j + 1) % around
+    return Mesh(
+        torch.as_tensor(x), torch.as_tensor(np.concatenate([np.c_[a, b, b + around], np.c_[a, b + around, a + around]]))
+    )
+
+
+def test_wide_cloth_is_drawn_in_under_narrow() -> None:
+    """Sides that stand out along curves from border to border cut nothing off; yet in they go, and the narrow stays."""
+    post = trimesh.creation.capsule(height=0.6, radius=0.1)
+    post.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], [0, 1, 0]))
+    post.apply_translation([0, -float(post.centroid[1]), 0])
+    body = Mesh(torch.as_tensor(np.array(post.vertices)), torch.as_tensor(np.array(post.faces)))
+    meshes = [tube(0.13, 0.13, 0.4), tube(0.19, 0.12, 0.3)]
+    assert meshes[0].vertices[:, 0].max() < meshes[1].vertices[:, 0].max() - 0.05
+    done = untangle(meshes, body, Untangling(tries=1, tuck=True))
+    assert done.clean and crossing(done.vertices, meshes) == 0
+    outer, inner = done.vertices
+    assert np.abs(inner[:, 0]).max() < np.abs(outer[:, 0]).max()
+    assert edge_change(meshes[0], outer) < 0.05
