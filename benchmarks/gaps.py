@@ -316,8 +316,10 @@ def page(found: dict) -> str:
     lines += ["pass through the body in the clip are turned out of it first (`recon.bodies.clearance`)."]
     lines += table("Table 1: the neutral body", found["table1"], True)
     if "baselines" in found:
-        lines += table("Baselines in the same frame, as many steps each", found["baselines"], False)
+        lines += table("Baselines and Table 2 in the same frame, as many steps each", found["baselines"], False)
         lines += ["", "snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility."]
+        lines += ["noext: ours without it, kext1: its stretch factor is one under contact, too. No last layer is"]
+        lines += ["fitted to drapes here."]
         data = sorted({row["card"]["data"] for row in found["baselines"].values()})
         lines += [f"Learned from: {'; '.join(data)}."]
     lines += [
@@ -399,7 +401,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--weights", type=Path, default=None)
     parser.add_argument("--names", nargs="*", default=None)
-    parser.add_argument("--baselines", type=Path, default=None, help="folder of NAME-ours, -snug and -ncs")
+    parser.add_argument("--baselines", type=Path, default=None, help="folder of NAME-ours, -snug, -ncs ...")
     parser.add_argument("--cases", type=int, default=100, help="random tangles of each family")
     parser.add_argument("--kept", type=Path, default=None, help="folder for measured tangles: a killed run goes on")
     parser.add_argument("--every", type=int, default=5, help="frames between two that are untangled")

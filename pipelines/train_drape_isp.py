@@ -1,8 +1,7 @@
 """Train ISP's displacement network D_s for a kind of garment: ``recon train drape-isp --kind top --motions FOLDER``.
 
 Self-supervised by physics (ISP Eq. 8): random garments of the kind on random bodies, their drapes drawn towards rest by
-strain, bending, gravity and contact with the body; no simulated drapes are needed. At the end the last layer is fitted
-to the network's own drapes after projective steps (:mod:`pipelines.isp_refit`; ``--teaching.bodies 0``: it is not).
+strain, bending, gravity and contact with the body; no simulated drapes are needed.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe
 from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, Sampling, read_motions
-from pipelines.isp_refit import IspTeaching, retaught
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import Clearance
@@ -82,8 +80,6 @@ class TrainDrapeIsp:
     """Distance from the body at which contact begins [m]."""
     pin: float = 50.0
     """Stiffness that keeps a waistband where skinning has it [J/m² per vertex]."""
-    teaching: IspTeaching = IspTeaching()
-    """How the last layer learns from the network's own drapes at the end."""
 
 
 def train_drape_isp(config: TrainDrapeIsp) -> Path:
@@ -101,16 +97,11 @@ def train_drape_isp(config: TrainDrapeIsp) -> Path:
     loss = Loss(config, body)
     net = loss.net
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"drape-isp-{config.kind}", net, adam, settings_of(config, ("teaching",)), config.out)
+    training = Training(f"drape-isp-{config.kind}", net, adam, settings_of(config), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
     training.run(Budget(config.minutes, config.steps), lambda share: loss(generator))
-    if config.teaching.bodies:
-        training.save()  # a run that is killed while it drapes need not learn again
-        retaught(net, loss.worn, loss.wardrobe, loss.sampler, body, config.teaching)
-    file = store(net, config, training)
-    training.checkpoint.unlink(missing_ok=True)
-    return file
+    return store(net, config, training)
 
 
 class Loss:

@@ -115,18 +115,13 @@ class DisplacementNet(nn.Module):
 
         Their nodes cover ``shape.box``, x along the fourth axis.
         """
-        h = self.states(transforms, shape, code)
-        found = self.shape.scale * self.out(self.narrow(h)).view(len(h), 2, self.shape.modes, 3)
-        return self.cosines(found.permute(0, 3, 1, 2))
-
-    def states(self, transforms: Tensor, shape: Tensor, code: Tensor) -> Tensor:
-        """As ``forward`` -> (B, width), of which the cosines' coefficients are linear functions."""
         pose = pose_features(transforms, self.shape.joints)
         x = torch.cat([pose, shape, code.expand(len(pose), -1)], 1)
         h = F.silu(self.first(x))
         for k, layer in enumerate(self.inner):
             h = h + F.silu(layer(h) + (self.again(x) if k == len(self.inner) // 2 else 0))
-        return h
+        found = self.shape.scale * self.out(self.narrow(h)).view(len(x), 2, self.shape.modes, 3)
+        return self.cosines(found.permute(0, 3, 1, 2))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.isp_refit import IspTeaching
 from pipelines.train_drape_isp import TrainDrapeIsp, moving_joints, train_drape_isp
 from pipelines.train_layers_isp import TrainLayersIsp, train_layers_isp
 from recon.bodies import load_body
@@ -51,9 +50,8 @@ def trained(tmp_path_factory, motions: Path) -> tuple[Path, TrainDrapeIsp]:
     """Both networks after some steps."""
     out = tmp_path_factory.mktemp("weights")
     config = TrainDrapeIsp(
-        "skirt", motions, out=out, steps=8, garments=3, vertices=300, bodies=2, worn=1, modes=60, rank=16, width=32,
-        teaching=IspTeaching(bodies=2, rounds=3, steps=2),
-    )  # fmt: skip
+        "skirt", motions, out=out, steps=8, garments=3, vertices=300, bodies=2, worn=1, modes=60, rank=16, width=32
+    )
     train_drape_isp(config)
     train_layers_isp(
         TrainLayersIsp(motions, weights=out, out=out, steps=2, garments=2, vertices=300, bodies=2, pairs=1)

@@ -10,6 +10,7 @@ import torch
 
 from pipelines.gaps_drapes import Drapes, Teaching, drapes
 from pipelines.gaps_refit import LinearMap, narrowed, refitted
+from pipelines.low_rank import low_rank
 from pipelines.train_gaps import TrainGaps, train_gaps
 from recon.bodies import load_body
 from recon.cloth.contact import BodyContact
@@ -138,3 +139,13 @@ def test_a_training_ends_with_the_fit_and_goes_on_from_it(body, tmp_path) -> Non
     assert train_gaps(fitted).is_file()
     with pytest.raises(UserError, match="another garment"):
         train_gaps(replace(fitted, garment="skirt:test:2", out=tmp_path / "third"))
+
+
+def test_a_layer_in_two_is_the_layer_where_states_are_few() -> None:
+    torch.manual_seed(0)
+    layer, states = torch.nn.Linear(9, 20), torch.randn(50, 3) @ torch.randn(3, 9) + 1
+    with torch.no_grad():
+        few, out = low_rank(layer, states, 3, lambda moved: moved)
+        torch.testing.assert_close(out(few(states)), layer(states), atol=1e-4, rtol=1e-4)
+        few, out = low_rank(layer, states, 1, lambda moved: moved)
+        assert float((out(few(states)) - layer(states)).norm()) > 0.1
