@@ -307,6 +307,10 @@ def _errors(figures: dict | None) -> str:
     return f"{figures['eps_e']:.2f}, {figures['eps_a']:.2f}, {figures['eps_c']:.2f} ± {figures['eps_c_std']:.2f}{out}"
 
 
+def _seconds(row: dict) -> str:
+    return f"{row['seconds']} ({row['cpu_seconds']})" if "cpu_seconds" in row else str(row["seconds"])
+
+
 def page(found: dict) -> str:
     """docs/results/gaps.md."""
     about = f"`python benchmarks/gaps.py` on {found['machine']}, {found['cores']} cores, {found['date']}."
@@ -351,22 +355,27 @@ def page(found: dict) -> str:
         "",
         "## Solver",
         "",
-        "| hanging square, vertices | seconds | lowest point m | residual | energy only fell |",
+        "| hanging square, vertices | seconds (of CPU) | lowest point m | residual | energy only fell |",
     ]
     lines += ["|---|---|---|---|---|"]
     for r in (*s["squares"].values(), s["reference"]):
-        lines.append(f"| {r['vertices']} | {r['seconds']} | {r['lowest']:.4f} | {r['residual']} | {r['energy_fell']} |")
+        lines.append(f"| {r['vertices']} | {_seconds(r)} | {r['lowest']:.4f} | {r['residual']} | {r['energy_fell']} |")
     lines += ["", f"The sag of the 5041-vertex square differs by {s['error_pct']} % from the finest.", ""]
     if "balls" in s:
         lines += [
-            "| draped ball, vertices | seconds | mean height m | residual | energy only fell |",
+            "| draped ball, vertices | seconds (of CPU) | mean height m | residual | energy only fell |",
             "|---|---|---|---|---|",
         ]
         for r in s["balls"]:
             lines.append(
-                f"| {r['vertices']} | {r['seconds']} | {r['height']:.4f} | {r['residual']} | {r['energy_fell']} |"
+                f"| {r['vertices']} | {_seconds(r)} | {r['height']:.4f} | {r['residual']} | {r['energy_fell']} |"
             )
-        lines += ["", f"The mean drop of the second differs by {s['ball_error_pct']} % from the finest.", ""]
+        lines += [
+            "",
+            "The ball's cloth: 60 cm square, friction 0.3 (without it none stays). The mean drop of the one before the",
+            f"last differs by {s['ball_error_pct']} % from the finest.",
+            "",
+        ]
     lines += ["## Untangling", ""]
     for family, u in found["tangles"].items():
         lines += [
