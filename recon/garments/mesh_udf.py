@@ -23,6 +23,12 @@ from recon.garments.udf_grid import Box, Field, find_band, slope
 from recon.garments.udf_signs import signs
 from recon.types import Mesh
 
+FLATTEST = 0.1
+"""Where a field is less steep than this, vertices move as if it were as steep."""
+ENDED = 0.3
+"""Borders beyond which the distance grows more slowly than this stay where they are: nothing says where they end."""
+LONGEST = 0.01
+"""Longest step of a vertex towards the surface [m]."""
 CHASE = 4
 """Steps of ``beside`` that a border may go after a surface that grew."""
 
@@ -103,7 +109,9 @@ class Frame:
         return replace(self, normal=self.normal.to(dtype), outward=self.outward.to(dtype))
 
 
-def follow(field: Field, mesh: Mesh, beside: float, frame: Frame | None = None, move: bool = False) -> Mesh:
+def follow(
+    field: Field, mesh: Mesh, beside: float, frame: Frame | None = None, held: Tensor | float | None = None
+) -> Mesh:
     """The mesh with vertices that carry the gradient of everything the field depends on (MeshUDF §3.3).
 
     On the surface an unsigned distance has no gradient, but ``beside`` it, it has. With n the normal, o the direction
@@ -111,31 +119,55 @@ def follow(field: Field, mesh: Mesh, beside: float, frame: Frame | None = None, 
 
         ∂v/∂z = n (∂u(v - α n)/∂z - ∂u(v + α n)/∂z) / 2        and on borders, in addition,   - o ∂u(v + α o)/∂z
 
-    each divided by how steep the field is there (1 for an exact one). The mesh says where to ask; the directions in
-    which vertices move are the field's own, which know nothing of the triangles' shapes.
+    each divided by how steep the field is there (1 for an exact one); on borders both changes are met together. The
+    mesh says where to ask; n is the field's own direction, which knows nothing of the triangles' shapes.
 
     Args:
         field: the field, differentiable in what it depends on.
         mesh: vertices (V, 3) [m] on or near the surface.
         beside: α [m]: about a cell; learned fields are good from a few millimetres on.
         frame: of the mesh, where known.
-        move: also take vertices to where the field now says that the surface is: for the mesh of a code nearby.
+        held: also take vertices to where the field is this again beside them: ``beside``, or what :func:`shown` says
+            that the field was from which the mesh was made; for the mesh of a code nearby.
     """
     frame = frame or Frame.of(mesh)
     at, rim = mesh.vertices.detach(), frame.border
-    asked = torch.cat([at + beside * frame.normal, at - beside * frame.normal, at[rim] + beside * frame.outward])
+    asked = _asked(mesh, beside, frame)
     known, gradient = slope(field, asked)
     found = field(asked)
     sizes = [len(at), len(at), len(rim)]
     above, below, out = gradient.split(sizes)
     normal, steep = _unit((above - below) / 2)
-    way, steep_out = _unit(out)
-    truly_out = known[2 * len(at) :] > 0.5 * beside
-    grown = found - (beside if move else found.detach())
+    ends = held[2 * len(at) :] if isinstance(held, Tensor) else known[2 * len(at) :]
+    grown = found - (found.detach() if held is None else held)
     up, down, beyond = grown.split(sizes)
-    vertices = at + ((down - up) / (2 * steep))[:, None] * normal
-    step = torch.where(truly_out, beyond / steep_out, 0.0)
-    return mesh.with_vertices(vertices.index_add(0, rim, -step[:, None] * way))
+    across = _limited((down - up) / (2 * steep))
+    # The normal's way changes the distance beyond the border too: both conditions are met together.
+    lean, skew = (out * normal[rim]).sum(1), (normal[rim] * frame.outward).sum(1)
+    steep_out = (out * frame.outward).sum(1) - lean * skew
+    end = _limited((-beyond - lean * across[rim]) / steep_out.clamp_min(ENDED))
+    end = torch.where((ends > 0.5 * beside) & (steep_out > ENDED), end, 0.0)
+    across = across.index_add(0, rim, -end * skew)
+    return mesh.with_vertices((at + across[:, None] * normal).index_add(0, rim, end[:, None] * frame.outward))
+
+
+def _limited(step: Tensor) -> Tensor:
+    """(N,) steps of at most ``LONGEST``."""
+    return step.clamp(-LONGEST, LONGEST)
+
+
+def shown(field: Field, mesh: Mesh, beside: float, frame: Frame) -> Tensor:
+    """(2 V + B,) what a field says beside a mesh [m], no gradient: learned ones neither vanish on the surface nor grow
+    evenly beyond borders. Held at this by :func:`follow`, a mesh of an unchanged field stays where it is."""
+    with torch.no_grad():
+        return field(_asked(mesh, beside, frame))
+
+
+def _asked(mesh: Mesh, beside: float, frame: Frame) -> Tensor:
+    """(2 V + B, 3) points above, below and, of borders, beyond a mesh's vertices."""
+    at = mesh.vertices.detach()
+    rim = at[frame.border] + beside * frame.outward
+    return torch.cat([at + beside * frame.normal, at - beside * frame.normal, rim])
 
 
 @torch.no_grad()
@@ -168,5 +200,5 @@ def chase(field: Field, before: Field, mesh: Mesh, beside: float, frame: Frame) 
 
 def _unit(v: Tensor) -> tuple[Tensor, Tensor]:
     """Directions (N, 3) and lengths (N,), kept from being small: no vertex jumps where the field is flat."""
-    length = v.norm(dim=1).clamp_min(0.5)
-    return v / length[:, None], length
+    length = v.norm(dim=1)
+    return v / length.clamp_min(1e-6)[:, None], length.clamp_min(FLATTEST)

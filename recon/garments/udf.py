@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.files.weights import read_weights
-from recon.garments.mesh_udf import Frame, Meshing, chase, follow, mesh_udf
+from recon.garments.mesh_udf import Frame, Meshing, chase, follow, mesh_udf, shown
 from recon.garments.udf_codes import CodeSearch, refined
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import CHUNK, Folded, UdfNets, UdfShape
@@ -186,9 +186,10 @@ class UdfDecoder:
         with torch.no_grad():
             field, before = self.field(latent.detach()), self.field(own.detach())
             if field.sided is None:
+                held = shown(before, mesh, BESIDE, frame)
                 mesh = chase(field, before, mesh, BESIDE, frame)
                 for _ in range(SETTLE):
-                    mesh = follow(field, mesh, BESIDE, frame, move=True)
+                    mesh = follow(field, mesh, BESIDE, frame, held)
             else:
                 level = beyond_borders(before, mesh, frame)
                 for _ in range(SETTLE):

@@ -1,8 +1,8 @@
 """Pseudo-signs for an unsigned field: on which side of the surface the corners of a band lie (MeshUDF §3.1).
 
 Two neighbouring corners vote by their distances and gradients whether the surface passes between them. Votes are wrong
-here and there (creases, sheets closer than a cell, borders), so they are followed along the tree of the surest ones,
-first within small blocks of the grid; between blocks the votes of all edges count together, and so on in larger blocks.
+here and there (creases, sheets closer than a cell, borders), and a wrong one may be as sure as any. So corners join
+along the surest votes into groups, and between groups the votes of all edges count together: a wrong one is outvoted.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ SURE = 0.3
 """Sum of the two distances, in cells, from which a vote counts in full: closer to the surface gradients are noise."""
 HIT = 0.05
 """Distance, in cells, at which a point counts as on the surface."""
-BLOCKS = ((4, 0.8), (12, 3.0), (36, 6.0), (1 << 20, 0.0))
-"""Sides of the blocks [cells] within which votes are settled, one after another, and how sure they must be."""
+LEAST = 1e-6
+"""Votes that are no surer than this are none."""
 SWEEPS = 6
 """Rounds in which single corners are outvoted."""
 
@@ -96,22 +96,35 @@ def _vote(a: Ends, b: Ends, cell: float) -> NDArray[np.float64]:
 
 
 def _settled(band: Band, edges: NDArray[np.int64], vote: NDArray) -> NDArray[np.int8]:
-    """Signs from the votes, block by block."""
+    """Signs from the votes: groups join along the surest of their summed votes, until no vote is left between any.
+
+    In each round every group names its surest neighbour, and the surer half of these join.
+    """
     count = len(band.at)
     sign, group = np.ones(count, np.int8), np.arange(count)
-    a, b = edges.T
-    first = np.arange(count)  # one corner of each group
-    for side, sure in BLOCKS:
-        block = band.at[first] // side
-        inside = (block[a] == block[b]).all(1) & (np.abs(vote) >= sure)
-        flip, label = _joined(a[inside], b[inside], vote[inside], len(first))
+    a, b, vote, groups = *edges.T, vote, count
+    while True:
+        counts = np.abs(vote) > LEAST
+        a, b, vote = a[counts], b[counts], vote[counts]
+        if not len(vote):
+            return sign
+        best = _surest(a, b, np.abs(vote), groups)
+        sure = np.abs(vote[best])
+        best = best[sure >= np.median(sure)]
+        flip, label = _joined(a[best], b[best], vote[best], groups)
         sign *= flip[group]
-        group = label[group]
-        first = np.full(label.max() + 1, count)
-        np.minimum.at(first, group, np.arange(count))
-        vote, a, b = vote * flip[a] * flip[b], label[a], label[b]
-        a, b, vote = _together(a, b, vote, len(first))
-    return sign
+        group, groups = label[group], int(label.max()) + 1
+        a, b, vote = _together(label[a], label[b], vote * flip[a] * flip[b], groups)
+
+
+def _surest(a: NDArray, b: NDArray, sure: NDArray, count: int) -> NDArray[np.int64]:
+    """Which links are the surest of a node at either of their ends."""
+    order = np.argsort(sure, kind="stable")
+    best = np.full((2, count), -1)
+    for side, ends in zip(best, (a, b), strict=True):
+        side[ends[order]] = order  # the last that is written stays
+    known = np.append(sure, -1.0)
+    return np.setdiff1d(np.where(known[best[0]] >= known[best[1]], *best), -1)
 
 
 def _together(a: NDArray, b: NDArray, vote: NDArray, count: int) -> tuple[NDArray, NDArray, NDArray]:

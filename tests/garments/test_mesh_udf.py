@@ -89,8 +89,11 @@ def test_a_vertex_follows_its_surface():
 
 def test_follow_moves_to_a_surface_nearby():
     mesh = mesh_udf(cylinder(0.15, 0.2), BOX, Meshing(48))
-    moved = follow(cylinder(0.156, 0.205), mesh, 0.015, move=True)
-    assert cylinder(0.156, 0.205)(moved.vertices).max() < 2e-3
+    moved, frame = mesh, Frame.of(mesh)
+    for _ in range(3):
+        moved = follow(cylinder(0.156, 0.205), moved, 0.015, frame, held=0.015)
+    assert cylinder(0.156, 0.205)(moved.vertices).max() < 7e-4
+    assert (cylinder(0.156, 0.205)(moved.vertices[frame.border] + 0.015 * frame.outward) - 0.015).abs().max() < 2e-4
     assert cylinder(0.156, 0.205)(mesh.vertices).median() > 5e-3
 
 
@@ -106,7 +109,7 @@ def test_gradients_reach_the_vertices_of_an_exact_field():
     assert abs(float(found[:, 1].sum()) - share) < 0.25 * share
 
 
-@pytest.mark.parametrize(("kind", "number"), [("top", 1), ("top", 13), ("skirt", 3), ("trousers", 0)])
+@pytest.mark.parametrize(("kind", "number"), [("top", 0), ("top", 13), ("skirt", 3), ("trousers", 0)])
 def test_exact_fields_of_garments_have_no_holes_and_one_layer(kind, number):
     truth = load_garments(kind, "test")[number].mesh
     mesh = mesh_udf(MeshField(truth), Box.around(truth.vertices), Meshing(128))

@@ -144,13 +144,12 @@ def test_decoded_garments_are_manifold_and_without_panels(trained):
     assert torch.equal(g.mesh.vertices, again.mesh.vertices)
 
 
-@pytest.mark.parametrize(("sided", "most"), [(True, 0.05), (False, 0.08)])
-def test_gradients_into_the_code_against_finite_differences(trained, monkeypatch, sided, most):
+@pytest.mark.parametrize("sided", [True, False])
+def test_gradients_into_the_code_against_finite_differences(trained, monkeypatch, sided):
     """How far vertices go when the code moves, against where the surface then is.
 
-    Without knowing sides so short a training leaves the field rough (5.3 % here): the target of 5 % is held on closed
-    forms in test_mesh_udf then. So is that of borders, in test_udf_sides: this decoder has learned next to nothing of
-    where surfaces end.
+    Borders are held to the target of 5 % in test_mesh_udf and test_udf_sides: this decoder has learned next to nothing
+    of where surfaces end.
     """
     decoder, _, _, tubes = trained
     monkeypatch.setattr("pipelines.udf_samples.ONE_WAY", 10.0)  # however unsure they are: derivatives hold anyway
@@ -172,7 +171,16 @@ def test_gradients_into_the_code_against_finite_differences(trained, monkeypatch
     chosen[Frame.of(g.mesh).border] = 0
     wanted = (slope * chosen).square().sum()
     (found,) = torch.autograd.grad((moved * slope * chosen).sum(), step)
-    assert abs(float(found / wanted) - 1) < most
+    assert abs(float(found / wanted) - 1) < 0.05
+
+
+def test_at_its_own_code_a_garment_stays_where_it_is(trained):
+    """Meshed by votes too: learned fields don't vanish on the surface, but vertices keep what they showed."""
+    decoder, *_ = trained
+    decoder = UdfDecoder(decoder.nets, decoder.all_codes, decoder.known)
+    g = decoder.decode(decoder.codes[0], 64)
+    again = decoder.decode_like(decoder.codes[0], g)
+    assert (again.mesh.vertices - g.mesh.vertices).abs().max() < 1e-5
 
 
 def test_codes_do_not_depend_on_the_order_or_number_of_points_much(trained):
