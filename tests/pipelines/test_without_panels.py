@@ -105,13 +105,13 @@ def _sizes(mesh):
 
 def test_the_code_of_a_silhouette_is_found(values, photo) -> None:
     quick = GarmentFit(
-        levels=((80, 12),), resolution=32, final_resolution=32, retrieval_resolution=24, retrieval_round=9, starts=1,
-        mahalanobis=0.0, neighbourhood=0.0, latent_rate=0.15, descent=Descent(patience=12),
+        levels=((80, 24),), resolution=32, final_resolution=32, retrieval_resolution=24, retrieval_round=9, starts=1,
+        mahalanobis=0.0, neighbourhood=0.0, latent_rate=0.15, descent=Descent(patience=24),
     )  # fmt: skip
     _, layer = fit_garment("skirt", values, [], photo, MODELS, quick)
     assert layer.garment.latent is not None and not layer.garment.has_panels
     best = (DECODER.codes - TRUE).norm(dim=1).min()
-    assert (layer.garment.latent - TRUE).norm() < 0.8 * best
+    assert (layer.garment.latent - TRUE).norm() < 0.5 * best
 
 
 def test_refined_without_panels(values, refined: Refined) -> None:
