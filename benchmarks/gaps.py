@@ -223,9 +223,15 @@ def networks(folder: Path | None, names: list[str], body: Body, motion: Motion, 
         found[name] = table1(name, folder, body, motion, 3, draw_apart=False)
         if every:
             found[name]["untangled"] = table1(name, folder, body, motion, every)["untangled"]
-        found[name]["card"] = {k: cards[f"gaps-{name}"][k] for k in ("steps", "minutes", "skinning", "data")}
+        card = cards[f"gaps-{name}"]
+        found[name]["card"] = {k: card[k] for k in ("minutes", "skinning", "data")} | {"steps": _learned(card)}
         print(name, found[name]["network"], flush=True)
     return found
+
+
+def _learned(card: dict) -> int:
+    """Steps of a network's training and of those that it went on from."""
+    return card["steps"] + (_learned(card["before"]) if "before" in card else 0)
 
 
 def other_bodies(folder: Path | None, names: list[str], body: Body, motion: Motion) -> dict:
@@ -328,7 +334,7 @@ def page(found: dict) -> str:
         lines += table("Baselines and Table 2 in the same frame, as many steps each", found["baselines"], False)
         lines += ["", "snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility."]
         lines += ["noext: ours without it, kext1: its stretch factor is one under contact, too. No last layer is"]
-        lines += ["fitted to drapes here."]
+        lines += ["fitted to drapes here. So early, what inextensibility adds is within what garments differ by."]
         data = sorted({row["card"]["data"] for row in found["baselines"].values()})
         lines += [f"Learned from: {'; '.join(data)}."]
     lines += [
