@@ -32,9 +32,10 @@ DEEPEST = 0.02
 def taught(draper: GapsDraper, motions: Sequence[Motion], body: Body, teaching: Teaching, kept: Path) -> GapsNet:
     """The whole of it: draped, fitted, narrowed. ``kept`` as in :func:`drapes`; its files go at the end."""
     known = drapes(draper, motions, body, teaching, kept)
-    net = refitted(draper.net, known, draper.bound, body, teaching)
+    problem = LinearMap.of(draper.net, known, teaching)
+    net = refitted(draper.net, problem, unposed_planes(known, draper.bound, body), teaching)
     rest = draper.garment if isinstance(draper.garment, Mesh) else draper.garment.mesh
-    net = narrowed(net, LinearMap.of(net, known, teaching).states[:, :-1], rest, teaching.rank)
+    net = narrowed(net, problem.states[:, :-1], rest, teaching.rank)
     for file in kept.parent.glob(f"{kept.name}-*.safetensors"):
         file.unlink()
     return net
@@ -50,6 +51,7 @@ class LinearMap:
     """(W + 1, R) from misses to the map's change."""
 
     @staticmethod
+    @torch.no_grad()
     def of(net: GapsNet, known: Drapes, teaching: Teaching) -> LinearMap:
         """Of the states that a network has in the frames that were draped."""
         rows = Drapes.rows(teaching)
@@ -60,20 +62,18 @@ class LinearMap:
         wanted = known.moved.flatten(0, 1).flatten(1).float()
         return LinearMap(states.float(), wanted, torch.linalg.solve(square, states.T).float())
 
-    def begun(self, net: GapsNet) -> Tensor:
-        """(W + 1, 3 V) the network's own map."""
-        return net.shape.scale * torch.cat([net.out.weight.T, net.out.bias[None]])
-
 
 @torch.no_grad()
-def refitted(net: GapsNet, known: Drapes, bound: Bound, body: Body, teaching: Teaching) -> GapsNet:
-    """The network (without basis and few drapes) whose last layer suits the drapes, and stays out of the body."""
-    problem = LinearMap.of(net, known, teaching)
-    found = problem.begun(net)
+def refitted(net: GapsNet, problem: LinearMap, planes: tuple[Tensor, Tensor], teaching: Teaching) -> GapsNet:
+    """The network (without basis and few drapes) whose last layer suits the drapes, and stays out of the body.
+
+    ``planes``: see :func:`unposed_planes`.
+    """
+    found = net.shape.scale * torch.cat([net.out.weight.T, net.out.bias[None]])
     for _ in range(2):  # the second knows which drapes are outliers
         miss = problem.wanted - problem.states @ found
         found = found + problem.inverse @ miss.clamp_(-OUTLIER, OUTLIER)
-    normal, gap = _unposed_planes(known, bound, body)
+    normal, gap = planes
     for _ in range(teaching.pushes):
         moved = (problem.states @ found - problem.wanted).unflatten(1, (-1, 3))
         lack = (teaching.margin - gap - (normal * moved).sum(-1)).clamp_(0, DEEPEST)
@@ -85,7 +85,7 @@ def refitted(net: GapsNet, known: Drapes, bound: Bound, body: Body, teaching: Te
     return fitted
 
 
-def _unposed_planes(known: Drapes, bound: Bound, body: Body) -> tuple[Tensor, Tensor]:
+def unposed_planes(known: Drapes, bound: Bound, body: Body) -> tuple[Tensor, Tensor]:
     """The body's planes beside the drapes as displacements see them: normals (R, V, 3), distances (R, V) [m]."""
     normals = []
     for shape, pose, place, normal in zip(known.shape, known.pose, known.place, known.normal, strict=True):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipelines.gaps_drapes import Drapes, Teaching, drapes
-from pipelines.gaps_refit import LinearMap, narrowed, refitted
+from pipelines.gaps_refit import LinearMap, narrowed, refitted, unposed_planes
 from pipelines.low_rank import low_rank
 from pipelines.train_gaps import TrainGaps, train_gaps
 from recon.bodies import load_body
@@ -99,15 +99,19 @@ def inside(net: GapsNet, known: Drapes, draper: GapsDraper, body) -> float:
     return float(torch.stack([BodyContact(b, body.faces).penetrating(v) for b, v in zip(bodies, x)]).double().mean())
 
 
+def fitted(draper: GapsDraper, known: Drapes, body, pushes: int) -> GapsNet:
+    problem, planes = LinearMap.of(draper.net, known, SMALL), unposed_planes(known, draper.bound, body)
+    return refitted(draper.net, problem, planes, replace(SMALL, pushes=pushes))
+
+
 def test_a_fitted_network_is_nearer_to_the_drapes_than_its_teacher(draper, known, body) -> None:
-    net = refitted(draper.net, known, draper.bound, body, replace(SMALL, pushes=0))
+    net = fitted(draper, known, body, 0)
     assert missed(net, known) < 0.6 * missed(draper.net, known)
 
 
 def test_pushes_bring_vertices_out_of_the_body(draper, known, body) -> None:
     deep = replace(known, moved=known.moved - 0.01 * known.normal, gap=known.gap - 0.01)
-    near = refitted(draper.net, deep, draper.bound, body, replace(SMALL, pushes=0))
-    out = refitted(draper.net, deep, draper.bound, body, SMALL)
+    near, out = (fitted(draper, deep, body, pushes) for pushes in (0, SMALL.pushes))
     assert inside(out, deep, draper, body) < 0.5 * inside(near, deep, draper, body)
 
 
