@@ -18,6 +18,7 @@ from torch import Tensor
 from pipelines.gaps_drapes import Drapes, Teaching, drapes
 from pipelines.low_rank import low_rank
 from recon.bodies import Body
+from recon.cloth.energies import Cloth
 from recon.draping.gaps import Bound, GapsDraper, GapsNet
 from recon.types import BodyPose, Mesh, Motion
 
@@ -106,7 +107,8 @@ def narrowed(net: GapsNet, states: Tensor, rest: Mesh, rank: int) -> GapsNet:
         rest: the garment (V, 3).
         rank: drapes, at most W.
     """
-    few, out = low_rank(net.out, states, rank, lambda moved: _counted(moved.unflatten(0, (-1, 3)), rest))
+    cloth = Cloth.from_mesh(rest)
+    few, out = low_rank(net.out, states, rank, lambda moved: _counted(moved.unflatten(0, (-1, 3)), cloth))
     found = GapsNet(replace(net.shape, rank=few.out_features))
     found.gru.load_state_dict(net.gru.state_dict())
     found.few.load_state_dict(few.state_dict())
@@ -114,10 +116,9 @@ def narrowed(net: GapsNet, states: Tensor, rest: Mesh, rank: int) -> GapsNet:
     return found
 
 
-def _counted(moved: Tensor, rest: Mesh) -> Tensor:
+def _counted(moved: Tensor, cloth: Cloth) -> Tensor:
     """Displacements (V, 3, N) -> (3 E + 3 V, N), whose squares add up."""
-    f, x = rest.faces, rest.vertices.detach().to(moved.dtype)
-    ends = torch.cat([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]).sort(1).values.unique(dim=0)
-    length = (x[ends[:, 0]] - x[ends[:, 1]]).norm(dim=1).clamp_min(1e-9)
-    edges = (moved[ends[:, 0]] - moved[ends[:, 1]]) / (length * len(ends) ** 0.5)[:, None, None]
-    return torch.cat([edges.flatten(0, 1), moved.flatten(0, 1) / (PLACE * len(x) ** 0.5)])
+    one, other = cloth.edges.unbind(1)
+    length = cloth.edge_lengths.to(moved).clamp_min(1e-9) * len(one) ** 0.5
+    edges = (moved[one] - moved[other]) / length[:, None, None]
+    return torch.cat([edges.flatten(0, 1), moved.flatten(0, 1) / (PLACE * len(moved) ** 0.5)])
