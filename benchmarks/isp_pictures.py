@@ -1,6 +1,6 @@
 """Pictures of decoded garments: the panels above, the garment on the neutral body below, side by side.
 
-python benchmarks/isp_pictures.py      # docs/results/isp-fits.jpg, isp-between.jpg, isp-edit.jpg, isp-texture.jpg
+python benchmarks/isp_pictures.py      # docs/results/isp-{fits,between,edit,texture,layers}.jpg
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from isp_layers import unseen_bodies, unseen_garments
 from isp_measures import SOURCES, code_of
 from numpy.typing import NDArray
 from picture import ROOT, draw_panels
@@ -22,6 +23,8 @@ from pipelines.fit_code import CodeFit
 from pipelines.fit_evidence import Bank
 from pipelines.palette import layer_colour
 from recon.bodies import load_body
+from recon.draping.isp import load_isp_draper
+from recon.draping.layering import load_layering
 from recon.files.codes import read_code
 from recon.garments.dataset import load_garments
 from recon.garments.isp import IspDecoder, load_isp
@@ -163,11 +166,29 @@ def six(folder: Path, truths: Sequence[Garment]) -> NDArray:
     return np.vstack([sheet(shown, captions, (260, 260), azimuth) for azimuth in (0.3, 3.4)])
 
 
+def layered(size: tuple[int, int] = (420, 300), seed: int = 21) -> NDArray:
+    """Trousers and two tops on four unseen bodies: each draped alone by D_s, and then layered by D_m."""
+    body, where = load_body(), unseen_bodies(4, load_body(), seed)
+    garments = unseen_garments("trousers", 1, 96, seed) + unseen_garments("top", 2, 96, seed)
+    with torch.no_grad():
+        posed, draper = body.pose(where), load_isp_draper(body)
+        alone = [draper.drape(g, posed) for g in garments]
+        ways = alone, load_layering()(garments, alone, posed.mesh)
+    rows = []
+    for layers in ways:
+        dressed = [[m.with_vertices(x) for m, x in zip(layers, xs)] for xs in zip(*(m.vertices for m in layers))]
+        people = [[Mesh(b, body.faces), *worn] for b, worn in zip(posed.mesh.vertices, dressed, strict=True)]
+        colours = [SKIN, *(layer_colour(k) for k in range(len(layers)))]
+        shown = [picture(p, colours, orbit_camera(p, 0.4, 0.05, size), look=FAST).numpy() for p in people]
+        rows.append(np.hstack(shown)[..., ::-1])
+    return np.vstack(rows)
+
+
 def main() -> None:
-    """Write the pictures of docs/results/isp.md."""
+    """Write the pictures of docs/results/isp.md and isp-layers.md."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "results")
-    parser.add_argument("--only", nargs="*", default=["texture", "between", "edit", "fits"])
+    parser.add_argument("--only", nargs="*", default=["texture", "between", "edit", "fits", "layers"])
     parser.add_argument("--six", type=Path, help="folder of shirt6's data and weights, for --only six")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -178,6 +199,7 @@ def main() -> None:
         "edit": lambda: edited(ROOT / "out" / "benchmarks"),
         "six": lambda: six(options.six, load_garments(options.six / "shirt6_train.npz")[:2]),
         "fits": lambda: fits((("top", 0), ("trousers", 1))),
+        "layers": layered,
     }
     for name in options.only:
         cv2.imwrite(str(options.out / f"isp-{name}.jpg"), makers[name](), [cv2.IMWRITE_JPEG_QUALITY, 85])
