@@ -8,7 +8,7 @@ Quasistatic Finite Elements and Flesh Simulation", and Liu et al. 2017, whose L-
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
@@ -41,6 +41,8 @@ class Curvature:
         self.inertia = doubles(cloth.masses) / LONG**2
         self.edges = cloth.edges.numpy()
         self.spring = cloth.fabric.thickness * (2 * cloth.fabric.lame_mu + cloth.fabric.lame_lambda)
+        count = len(cloth.masses)
+        self.pattern = Pattern([self.faces, self.hinges, self.edges, np.arange(count)[:, None]], count)
 
     def solve(
         self, x: NDArray, contacts: Contacts, settings: PolishSettings, held: NDArray, firm: float
@@ -50,14 +52,16 @@ class Curvature:
         ``firm``: stiffness of springs along the edges that are added, in units of the membrane's: out of its plane
         flat cloth is stiff only once it has moved, and steps that don't know that are too long.
         """
-        parts = [self._membrane(x), self._bends(x), *_touching(x, contacts, settings)]
         link = np.array([[1.0, -1.0], [-1.0, 1.0]])[None, :, :, None, None] * (firm * self.spring * np.eye(3))
-        parts.append((self.edges, np.repeat(link, len(self.edges), 0)))
         diagonal = self.inertia + 1e-9 * self.spring
         diagonal[held] = 1e3 * self.spring
-        parts.append((np.arange(len(x))[:, None], (diagonal[:, None, None] * np.eye(3))[:, None, None]))
+        springs = np.broadcast_to(link, (len(self.edges), 2, 2, 3, 3))
+        matrix = self.pattern([self._membrane(x), self._bends(x), springs, diagonal[:, None, None] * np.eye(3)])
+        touching = [(v, b) for v, b in _touching(x, contacts, settings) if len(v)]
+        if touching:
+            matrix = matrix + Pattern([v for v, _ in touching], len(x))([b for _, b in touching])
         # Single precision: a third less time, and hardly more steps; the energy itself is in doubles.
-        matrix = assembled(parts, len(x)).astype(np.float32)
+        matrix = matrix.astype(np.float32)
         factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
         def times(q: NDArray) -> NDArray:
@@ -67,7 +71,7 @@ class Curvature:
 
         return times
 
-    def _membrane(self, x: NDArray) -> Blocks:
+    def _membrane(self, x: NDArray) -> NDArray:
         corners, (a, b) = x[self.faces], self.ways
         u, v = np.einsum("fk,fki->fi", a, corners), np.einsum("fk,fki->fi", b, corners)
         uu, vv, uv = 0.5 * ((u * u).sum(1) - 1), 0.5 * ((v * v).sum(1) - 1), 0.5 * (u * v).sum(1)
@@ -83,11 +87,11 @@ class Curvature:
         pulled = (axes * np.maximum(size, 0)[:, None]) @ axes.transpose(0, 2, 1)
         ways = np.stack([a, b], 1)
         blocks = blocks + (ways.transpose(0, 2, 1) @ pulled @ ways)[..., None, None] * np.eye(3)
-        return self.faces, blocks * self.volumes[:, None, None, None, None]
+        return blocks * self.volumes[:, None, None, None, None]
 
-    def _bends(self, x: NDArray) -> Blocks:
+    def _bends(self, x: NDArray) -> NDArray:
         change = angle_changes(x, self.hinges)
-        return self.hinges, np.einsum("h,hki,hlj->hklij", self.bending, change, change)
+        return (self.bending[:, None, None] * change)[:, :, None, :, None] * change[:, None, :, None, :]
 
 
 def angle_changes(x: NDArray, hinges: NDArray) -> NDArray:
@@ -134,15 +138,20 @@ def _between(vertices: NDArray, weights: NDArray, stiff: NDArray) -> Blocks:
     return vertices, (way[:, :, None] * way[:, None, :])[..., None, None] * stiff[:, None, None]
 
 
-def assembled(parts: list[Blocks], vertices: int) -> sp.csc_matrix:
-    """(3 V, 3 V) sum of all blocks."""
-    row = np.concatenate([np.repeat(v, v.shape[1], 1).ravel() for v, _ in parts])
-    column = np.concatenate([np.tile(v, (1, v.shape[1])).ravel() for v, _ in parts])
-    values = np.concatenate([b.reshape(-1, 9) for _, b in parts])
-    key, which = np.unique(row * vertices + column, return_inverse=True)
-    sums = sp.csr_matrix(
-        (np.ones(len(which)), (which.reshape(-1), np.arange(len(which)))), shape=(len(key), len(which))
-    )
-    data = (sums @ values).reshape(-1, 3, 3)
-    starts = np.searchsorted(key // vertices, np.arange(vertices + 1))
-    return sp.bsr_matrix((data, key % vertices, starts), shape=(3 * vertices, 3 * vertices)).tocsc()
+class Pattern:
+    """Where the blocks of a symmetric matrix go; found once, and filled as often as needed."""
+
+    def __init__(self, corners: Sequence[NDArray], vertices: int):
+        """``corners``: of each part, (K, n) vertices; ``vertices``: V."""
+        row = np.concatenate([np.repeat(v, v.shape[1], 1).ravel() for v in corners])
+        column = np.concatenate([np.tile(v, (1, v.shape[1])).ravel() for v in corners])
+        key, which = np.unique(row * vertices + column, return_inverse=True)
+        ones, at = np.ones(len(which)), np.arange(len(which))
+        self.sums = sp.csr_matrix((ones, (which.reshape(-1), at)), shape=(len(key), len(which)))
+        self.columns, self.size = key % vertices, 3 * vertices
+        self.starts = np.searchsorted(key // vertices, np.arange(vertices + 1))
+
+    def __call__(self, blocks: Sequence[NDArray]) -> sp.csc_matrix:
+        """(3 V, 3 V) sum of each part's blocks (K, n, n, 3, 3)."""
+        data = (self.sums @ np.concatenate([b.reshape(-1, 9) for b in blocks])).reshape(-1, 3, 3)
+        return sp.bsr_matrix((data, self.columns, self.starts), shape=(self.size, self.size)).tocsr().T
