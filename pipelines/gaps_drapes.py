@@ -130,7 +130,7 @@ def _window(
     pose, place = pose[1:][rows], place[1:][rows]
     moved = draper.net(features, shape)[0][0, rows]
     posed = body.pose(BodyPose(shape.expand(len(rows), -1), pose, place))
-    guess = draper.bound.place(moved, posed.transforms, posed.shape)
+    guess = draper.placed(moved, posed.transforms, posed.shape)
     x = steps(guess, posed)
     normal, gap = steps.planes(x, posed)
     moved = moved + draper.bound.unposed(x - guess, posed.transforms)

@@ -27,7 +27,16 @@ from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.binding import METHODS
 from recon.draping.dress import held_vertices
-from recon.draping.gaps import Bound, GapsDraper, GapsNet, GapsShape, load_gaps, motion_features, smooth_basis
+from recon.draping.gaps import (
+    Bound,
+    GapsDraper,
+    GapsNet,
+    GapsShape,
+    edge_layer,
+    load_gaps,
+    motion_features,
+    smooth_basis,
+)
 from recon.files.weights import read_manifest, write_weights
 from recon.garments.panels import border_loops
 from recon.types import BodyPose, Garment, Mesh, Motion, UserError
@@ -76,13 +85,16 @@ class TrainGaps:
     """GRU layers."""
     modes: int = 800
     """Smoothest functions on the garment that displacements are learned in."""
+    edge_rounds: int = 2
+    """Rounds of edge projection that end the network, and are learned through; 0 = none, as in the paper."""
     skinning: str = "rbf"
     """How the garment rides on the body: rbf, gaps, nearest, k_nearest or smoothed."""
-    inextensibility: float = 1e-4
-    """Strength of Eq. 15 per vertex [J]; 0 = without."""
+    inextensibility: float = 1e-3
+    """Strength of Eq. 15 per vertex [J]; 0 = without. Five times as much lengthens triangles instead: rings as wide as
+    they are long hardly say which way."""
     relax: bool = True
     """Let the stretch factor out where cloth collides (Eq. 16); False holds it at 1."""
-    collision: float = 5e3
+    collision: float = 1e4
     """k_c of Eq. 11 [J/m³ per vertex]; the paper's 250 leaves more in the body on our finer meshes."""
     margin: float = 0.003
     """Distance from the body at which collision begins [m]."""
@@ -150,11 +162,12 @@ def train_gaps(config: TrainGaps) -> Path:
 def learn(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
     """The training itself."""
     torch.manual_seed(config.seed)
-    shape = GapsShape(len(template.mesh.vertices), body.n_shape, config.width, config.layers)
+    count = len(template.mesh.vertices)
+    shape = GapsShape(count, body.n_shape, config.width, config.layers, edge_rounds=config.edge_rounds)
     net = GapsNet(shape, smooth_basis(template.mesh.vertices, template.mesh.faces, config.modes))
     if config.start:
         known = _known(template, body, config).net
-        if replace(known.shape, rank=0) != shape:
+        if replace(known.shape, rank=0, edge_rounds=config.edge_rounds) != shape:
             raise UserError(f"{config.start}: found a network of {known.shape}; wanted {shape}")
         net.take_over(known)
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
@@ -188,6 +201,7 @@ class Loss:
     def __init__(self, template: Template, motions: list[Motion], body: Body, config: TrainGaps):
         self.template, self.motions, self.body, self.config = template, motions, body, config
         self.bound = Bound.of(template.mesh.vertices, template.mesh.faces, body, config.skinning)
+        self.edges = edge_layer(template.thing, config.edge_rounds)
         rings = OneRings.of(template.mesh.vertices, template.mesh.faces)
         weights = FrameWeights(
             collision=config.collision,
@@ -237,7 +251,7 @@ class Loss:
         last = slice(-c.frames, None)
         with torch.no_grad():
             body = self.body.pose(BodyPose(many, pose[:, last].flatten(0, 1), place[:, last].flatten(0, 1)))
-        x = self.bound.place(moved.flatten(0, 1), body.transforms, many)
+        x = self.edges(self.bound.place(moved.flatten(0, 1), body.transforms, many))
         energy, terms = self.physics(x, body.mesh.vertices, epoch=100 * min(1.0, 2 * share))
         path = x.unflatten(0, (c.windows, c.frames))
         swung = inertia(self.template.cloth, path[:, 2:], path[:, 1:-1], path[:, :-2], 1 / c.fps).sum(1)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from recon.bodies import Body
 from recon.bodies.rig import rotation_matrices
 from recon.bodies.skin import shaped, skin
+from recon.cloth.edges import EdgeProjection
 from recon.cloth.energies import Cloth
 from recon.cloth.projective import Projecting, Projective
 from recon.draping.binding import METHODS, BodyField, cloth_operators
@@ -52,6 +53,8 @@ class GapsShape:
     """Displacement [m] that an output of one means."""
     rank: int = 0
     """Drapes that the last layer mixes; 0 = displacements straight from the states."""
+    edge_rounds: int = 0
+    """Rounds of edge projection (:mod:`recon.cloth.edges`) that end the network, on the posed garment."""
 
 
 class GapsNet(nn.Module):
@@ -208,6 +211,7 @@ class GapsDraper:
         last = self.net.out  # by columns in memory: one frame's product takes half the time
         last.weight = nn.Parameter(last.weight.T.contiguous().T, requires_grad=False)
         self.garment, self.bound = garment, bound
+        self.edges = edge_layer(garment, net.shape.edge_rounds)
         self.projective = projective
 
     @torch.no_grad()
@@ -215,8 +219,12 @@ class GapsDraper:
         """All frames of one motion at once: (F, V, 3) [m]. ``body``: the F posed bodies of ``pose``."""
         features = motion_features(pose.pose[None], pose.translation[None], fps)
         moved, _ = self.net(features, pose.shape[:1], self._warm(features[:, :1], pose.shape[:1]))
-        drapes = self.bound.place(moved[0], body.transforms, pose.shape)
+        drapes = self.placed(moved[0], body.transforms, pose.shape)
         return self.projective(drapes, body) if self.projective else drapes
+
+    def placed(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
+        """As ``Bound.place``, edges drawn to their lengths."""
+        return self.edges(self.bound.place(moved, transforms, shape))
 
     @torch.no_grad()
     def stream(self, frames: Iterable[BodyPose], body: Body, fps: float) -> Iterator[Tensor]:
@@ -235,7 +243,7 @@ class GapsDraper:
                 if hidden is None:
                     hidden = self._warm(features, shape)
                 moved, hidden = self.net(features, shape, hidden)
-                drape = skin(rest + moved[0], rig.transforms.to(rest), self.bound.weights)
+                drape = self.edges(skin(rest + moved[0], rig.transforms.to(rest), self.bound.weights))
             yield self.projective(drape, body.pose(pose)) if self.projective else drape
 
     def _warm(self, first: Tensor, shape: Tensor) -> Tensor:
@@ -243,6 +251,12 @@ class GapsDraper:
         still = first.clone()
         still[..., -6:] = 0
         return self.net.remember(still.expand(-1, WARM_UP, -1), shape)[1]
+
+
+def edge_layer(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
+    """The rounds that end the network; a waistband stays where skinning and the network have it."""
+    mesh = garment.mesh if isinstance(garment, Garment) else garment
+    return EdgeProjection(Cloth.from_mesh(mesh), rounds, torch.as_tensor(held_vertices(garment)))
 
 
 def load_gaps(name: str, body, folder: str | Path | None = None, projecting: Projecting | None = None) -> GapsDraper:
