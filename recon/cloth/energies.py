@@ -73,8 +73,7 @@ class Cloth:
         if not garment.has_panels:
             at = garment.mesh.vertices if garment.unstrained is None else garment.unstrained
             return cls.from_mesh(Mesh(at.to(garment.panel_points.dtype), garment.mesh.faces), fabric)
-        flat = garment.panel_points.detach()[garment.panel_faces]  # (F, 3, 2)
-        flat = torch.where((garment.side_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
+        flat = _flat(garment).detach()
         return cls.from_triangles(garment.mesh.faces, flat, garment.mesh.vertices.shape[-2], fabric)
 
     @classmethod
@@ -106,6 +105,17 @@ class Cloth:
         masses = masses.index_add(0, faces.reshape(-1), share.repeat_interleave(3))
         rest_angles = torch.zeros_like(hinge_weights)
         return cls(faces, inverse, areas, edges, edge_lengths, hinges, hinge_weights, masses, rest_angles, fabric)
+
+
+def rest_edges(garment: Garment) -> tuple[Tensor, Tensor]:
+    """Edges (E, 2) of a garment with panels, each once, and their lengths (E,) in the panels [m], differentiable."""
+    return _edges(garment.mesh.faces, _flat(garment))
+
+
+def _flat(garment: Garment) -> Tensor:
+    """(F, 3, 2) each triangle in its panel, as seen from outside [m]."""
+    flat = garment.panel_points[garment.panel_faces]
+    return torch.where((garment.side_of_face == 1)[:, None, None], flat * flat.new_tensor([-1.0, 1.0]), flat)
 
 
 def _edges(faces: Tensor, flat: Tensor) -> tuple[Tensor, Tensor]:

@@ -256,7 +256,7 @@ class GapsDraper:
 def edge_layer(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
     """The rounds that end the network; a waistband stays where skinning and the network have it."""
     mesh = garment.mesh if isinstance(garment, Garment) else garment
-    return EdgeProjection(Cloth.from_mesh(mesh), rounds, torch.as_tensor(held_vertices(garment)))
+    return EdgeProjection.of(Cloth.from_mesh(mesh), rounds, torch.as_tensor(held_vertices(garment)))
 
 
 def load_gaps(name: str, body, folder: str | Path | None = None, projecting: Projecting | None = None) -> GapsDraper:

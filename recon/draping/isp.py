@@ -1,7 +1,8 @@
 """Draping by ISP's displacement network D_s: skinning, corrected by a learned map over the panels (ISP §3.2, Eq. 7-8).
 
 The network gives two displacement maps, front and back, for a pose, a shape and a garment; they are read at the points
-of the panels, averaged at the seams and added to the garment at rest before it is skinned. Its maps are sums of smooth
+of the panels, averaged at the seams and added to the garment at rest before it is skinned; at the end a few rounds draw
+each edge towards its length (:mod:`recon.cloth.edges`). Its maps are sums of smooth
 cosines instead of the paper's N x N numbers, and it knows a garment by its rest maps' principal components instead of
 by a decoder's code: so it drapes whatever has panels of its kind, and still does when a decoder is trained anew.
 """
@@ -21,6 +22,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from recon.bodies.rig import PARENTS
+from recon.cloth.edges import EdgeProjection
+from recon.cloth.energies import rest_edges
+from recon.draping.dress import held_vertices
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, rest_features
@@ -32,6 +36,9 @@ FARTHEST = 1.0
 they were there: beyond, the network guesses (a wide jacket strained to six times skinning's)."""
 KEPT = 4
 """So many garments stay prepared."""
+EDGE_ROUNDS = 4
+"""Rounds of edge projection that end a drape. They are not learned through: on the coarse garments that D_s learns on
+they would reach further than on the fine ones that it drapes."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +146,7 @@ class Worn:
     code: Tensor
     cells: tuple[int, int]
     """Nodes of a map along x and y."""
+    edges: EdgeProjection
 
     @classmethod
     def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:
@@ -154,6 +162,7 @@ class Worn:
             Welding.of(garment),
             net.code(garment),
             map_size(box),
+            EdgeProjection(*rest_edges(garment), len(weights), EDGE_ROUNDS, torch.as_tensor(held_vertices(garment))),
         )
 
     @cached_property
@@ -219,7 +228,7 @@ class IspDraper:
         """
         worn, net = self.prepare(garment), self.nets[garment.kind]
         moved = worn.displaced(net(body.transforms, body.shape, worn.code))
-        return Mesh(worn.bound.place(moved, body.transforms, body.shape), garment.mesh.faces)
+        return Mesh(worn.edges(worn.bound.place(moved, body.transforms, body.shape)), garment.mesh.faces)
 
 
 def load_isp_draper(body, folder: str | Path | None = None, kinds: Sequence[str] | None = None) -> IspDraper:
