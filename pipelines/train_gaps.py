@@ -32,10 +32,10 @@ from recon.draping.gaps import (
     GapsDraper,
     GapsNet,
     GapsShape,
-    edge_layer,
     load_gaps,
     motion_features,
     smooth_basis,
+    template_edges,
 )
 from recon.files.weights import read_manifest, write_weights
 from recon.garments.panels import border_loops
@@ -201,7 +201,7 @@ class Loss:
     def __init__(self, template: Template, motions: list[Motion], body: Body, config: TrainGaps):
         self.template, self.motions, self.body, self.config = template, motions, body, config
         self.bound = Bound.of(template.mesh.vertices, template.mesh.faces, body, config.skinning)
-        self.edges = edge_layer(template.thing, config.edge_rounds)
+        self.edges = template_edges(template.thing, config.edge_rounds)
         rings = OneRings.of(template.mesh.vertices, template.mesh.faces)
         weights = FrameWeights(
             collision=config.collision,

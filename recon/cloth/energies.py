@@ -108,8 +108,10 @@ class Cloth:
 
 
 def rest_edges(garment: Garment) -> tuple[Tensor, Tensor]:
-    """Edges (E, 2) of a garment with panels, each once, and their lengths (E,) in the panels [m], differentiable."""
-    return _edges(garment.mesh.faces, _flat(garment))
+    """Edges (E, 2), each once, and their lengths (E,) in the panels or, without, at rest [m]; differentiable."""
+    faces = garment.mesh.faces
+    at = garment.mesh.vertices if garment.unstrained is None else garment.unstrained
+    return _edges(faces, _flat(garment) if garment.has_panels else at[faces])
 
 
 def _flat(garment: Garment) -> Tensor:
@@ -119,7 +121,7 @@ def _flat(garment: Garment) -> Tensor:
 
 
 def _edges(faces: Tensor, flat: Tensor) -> tuple[Tensor, Tensor]:
-    """Unique edges and their rest lengths (mean over the triangles that share them)."""
+    """Unique edges and their rest lengths (mean over the triangles that share them); ``flat``: (F, 3, 2 or 3)."""
     ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values
     corners = torch.cat([flat[:, [0, 1]], flat[:, [1, 2]], flat[:, [2, 0]]])
     lengths = (corners[:, 0] - corners[:, 1]).norm(dim=-1)

@@ -21,7 +21,9 @@ from torch import Tensor, nn
 
 from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
+from recon.cloth.edges import EdgeProjection
 from recon.draping.body_field import JOINTS, BodyFieldNet
+from recon.draping.dress import edge_layer
 from recon.draping.isp import pose_features
 from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
 from recon.draping.nodes import Nodes
@@ -38,6 +40,8 @@ NODE_WIDTH = 0.0125
 """Distance of the nodes at which a fine mesh asks the networks [m]: draped vertices are 0.3 mm off in the mean."""
 MANY = 20_000
 """Meshes of more vertices than this may be finer than the nodes."""
+EDGE_ROUNDS = 4
+"""Rounds of edge projection that end a drape, as those of D_s (:mod:`recon.draping.isp`)."""
 FEW = 8
 """Up to so many bodies a garment is draped at once, and not made ready first."""
 
@@ -162,6 +166,8 @@ class Known:
     """(z,)."""
     above: Tensor | None = None
     """(z,) code of the garment over it, for the solver."""
+    edges: EdgeProjection | None = None
+    """What ends a drape; None: nothing."""
 
 
 class DrapeNets(nn.Module):
@@ -221,11 +227,16 @@ class DrapeNets(nn.Module):
         return Prepared(x, weights, directions, matrix, code, solved, nodes, shape_nodes)
 
     def draped(self, mesh: Mesh, group: str, body: PosedBody, known: Known) -> Tensor:
-        """A mesh at rest on B bodies -> (B, N, 3): what ``prepare``, ``moved`` and ``place`` give.
+        """A mesh at rest on B bodies -> (B, N, 3): what ``prepare``, ``moved`` and ``place`` give, edges drawn to their
+        lengths.
 
         For few bodies (``FEW``), where nobody asks for gradients and ``exact`` is not set, shape and pose are folded
         into the networks, which are asked as ``prepare`` says: sooner, and the same up to roundings (0.1 mm).
         """
+        x = self._draped(mesh, group, body, known)
+        return x if known.edges is None else known.edges(x)
+
+    def _draped(self, mesh: Mesh, group: str, body: PosedBody, known: Known) -> Tensor:
         x, above = mesh.vertices, known.above
         if self.exact or len(body.shape) > FEW or not silent(self, x, known.code, body.shape, body.transforms):
             ready = self.prepare(mesh, group, known.bound, above, known.code)
@@ -282,21 +293,24 @@ class DrapeNetDraper:
             return group_of(garment.kind)
         return "top" if float(garment.mesh.vertices.detach()[:, 1].max()) > self.chest else "bottom"
 
-    def known(self, mesh: Mesh) -> Known:
-        """Skinning of a mesh as the networks learned it, and its code; of the last mesh they are remembered."""
-        if mesh.vertices.requires_grad and torch.is_grad_enabled():
-            return Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh))
+    def known(self, garment: Garment) -> Known:
+        """Skinning of a garment as the networks learned it, its code and edges; of the last one remembered."""
+        mesh = garment.mesh
         if self._last is None or self._last[0] is not mesh.vertices:
-            self._last = mesh.vertices, Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh))
+            edges = edge_layer(garment, EDGE_ROUNDS)
+            found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), edges=edges)
+            if mesh.vertices.requires_grad and torch.is_grad_enabled():
+                return found
+            self._last = mesh.vertices, found
         return self._last[1]
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
         """The garment on B bodies: Mesh with (B, N, 3) vertices; the layers beneath play no part (see ``outfit``)."""
-        return self._draped(garment, body, self.known(garment.mesh))
+        return self._draped(garment, body, self.known(garment))
 
     def outfit(self, top: Garment, bottom: Garment, body: PosedBody) -> tuple[Mesh, Mesh]:
         """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9)."""
-        over, beneath = self.known(top.mesh), self.known(bottom.mesh)
+        over, beneath = self.known(top), self.known(bottom)
         lower = self._draped(bottom, body, replace(beneath, above=over.code))
         return self._draped(top, body, over), lower
 

@@ -211,7 +211,7 @@ class GapsDraper:
         last = self.net.out  # by columns in memory: one frame's product takes half the time
         last.weight = nn.Parameter(last.weight.T.contiguous().T, requires_grad=False)
         self.garment, self.bound = garment, bound
-        self.edges = edge_layer(garment, net.shape.edge_rounds)
+        self.edges = template_edges(garment, net.shape.edge_rounds)
         self.projective = projective
 
     @torch.no_grad()
@@ -253,8 +253,8 @@ class GapsDraper:
         return self.net.remember(still.expand(-1, WARM_UP, -1), shape)[1]
 
 
-def edge_layer(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
-    """The rounds that end the network; a waistband stays where skinning and the network have it."""
+def template_edges(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
+    """The rounds that end the network: lengths are the template's, as in Eq. 15; a waistband stays."""
     mesh = garment.mesh if isinstance(garment, Garment) else garment
     return EdgeProjection.of(Cloth.from_mesh(mesh), rounds, torch.as_tensor(held_vertices(garment)))
 

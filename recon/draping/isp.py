@@ -23,8 +23,7 @@ from torch import Tensor, nn
 
 from recon.bodies.rig import PARENTS
 from recon.cloth.edges import EdgeProjection
-from recon.cloth.energies import rest_edges
-from recon.draping.dress import held_vertices
+from recon.draping.dress import edge_layer
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, rest_features
@@ -162,7 +161,7 @@ class Worn:
             Welding.of(garment),
             net.code(garment),
             map_size(box),
-            EdgeProjection(*rest_edges(garment), len(weights), EDGE_ROUNDS, torch.as_tensor(held_vertices(garment))),
+            edge_layer(garment, EDGE_ROUNDS),
         )
 
     @cached_property
