@@ -18,6 +18,7 @@ import platform
 import statistics
 import time
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from draping import tube
 
 from pipelines.gaps_drapes import Teaching
 from pipelines.sequence import led_in, measure, untangled
+from pipelines.train_gaps import TrainGaps
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import clear_motion
 from recon.bodies.retarget import motion_of
@@ -84,8 +86,8 @@ def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000, repeats:
     body's vertices, without steps); the same of a last layer that reads all states, as before it is fitted to drapes;
     and the CPU time of one frame.
     """
-    net = GapsNet(GapsShape(vertices, body.n_shape, rank=Teaching.rank))
-    wide = GapsNet(GapsShape(vertices, body.n_shape))
+    shape = GapsShape(vertices, body.n_shape, rank=Teaching.rank, edge_rounds=TrainGaps.edge_rounds)
+    net, wide = GapsNet(shape), GapsNet(replace(shape, rank=0))
     pose = torch.zeros(frames, 24, 3)
     pose[:, 16, 2] = torch.linspace(-1.2, 0, frames)
     whole = BodyPose(torch.zeros(frames, body.n_shape), pose, torch.zeros(frames, 3))

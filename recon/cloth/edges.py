@@ -8,7 +8,6 @@ so that networks learn what the rounds do not do. It has no parameters.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -38,15 +37,13 @@ class EdgeProjection:
         """
         self.rounds, self.count, self.lengths = rounds, vertices, lengths
         self.device = str(edges.device)
-        one, other = torch.cat([edges, edges.flip(1)]).unbind(1)
-        order = torch.argsort(one, stable=True)
-        self.edge = order % max(len(edges), 1)
-        degree = torch.bincount(one, minlength=vertices)
-        share = 0.5 * FACTOR / degree.clamp_min(1)
+        share = 0.5 * FACTOR / torch.bincount(edges.flatten(), minlength=vertices).clamp_min(1)
         if held is not None:
             share[held] = 0
-        starts = torch.cat([degree.new_zeros(1), degree.cumsum(0)])
-        self.known = [*(self._kept(t.int(), int) for t in (starts, other[order])), self._kept(share.float(), float)]
+        self.known = _Edges()
+        self.known.ends = wp.array(edges.int().cpu().numpy(), dtype=wp.vec2i, device=self.device)
+        self.known.lengths = self._floats(lengths.detach())
+        self.known.share = self._floats(share)
 
     @classmethod
     def of(cls, cloth: Cloth, rounds: int, held: Tensor | None = None) -> EdgeProjection:
@@ -57,115 +54,86 @@ class EdgeProjection:
         """Drapes (..., V, 3) float32 [m] -> as many; differentiable in them and the lengths (once)."""
         return _Project.apply(x, self.lengths, self) if self.rounds else x
 
-    @cached_property
-    def halves(self) -> wp.array:
-        """(2 E,) the lengths as the kernels read them."""
-        return self._kept(self.lengths.detach()[self.edge].float(), float)
+    def _floats(self, tensor: Tensor) -> wp.array:
+        return wp.array(tensor.float().cpu().numpy(), dtype=float, device=self.device)
 
-    def _kept(self, tensor: Tensor, kind: type) -> wp.array:
-        return wp.array(tensor.cpu().numpy(), dtype=kind, device=self.device)
-
-    def round(self, kernel: Any, *tensors: Tensor) -> None:
-        """One round of a kernel on (B, V, 3) each."""
-        views = [wp.from_torch(t.view(-1, 3), dtype=wp.vec3) for t in tensors]
-        wp.launch(kernel, (len(tensors[0]), self.count), inputs=[*self.known, self.halves, *views], device=self.device)
-
-    def lengths_slope(self, x: Tensor, grad: Tensor) -> Tensor:
-        """(E,) what one round from ``x`` adds to the lengths' gradient; ``grad`` is that of what it led to."""
-        out = x.new_zeros(len(self.edge))
-        for one, g in zip(x, grad, strict=True):
-            at = [wp.from_torch(t, dtype=wp.vec3) for t in (one, g)]
-            inputs = [*self.known, *at, wp.from_torch(out)]
-            wp.launch(_lengths_back, self.count, inputs=inputs, device=self.device)
-        return torch.zeros_like(self.lengths).index_add(0, self.edge, out.to(self.lengths))
+    def launch(self, kernel: Any, drapes: int, *tensors: Tensor) -> None:
+        """A kernel with one thread for each of so many drapes."""
+        views = [wp.from_torch(t, dtype=wp.vec3 if t.dim() == 4 else None) for t in tensors]
+        wp.launch(kernel, drapes, inputs=[self.known, *views], device=self.device)
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, lengths: Tensor, edges: EdgeProjection) -> Tensor:
-        at = [x.detach().reshape(-1, edges.count, 3).contiguous()]
-        for _ in range(edges.rounds):
-            at.append(torch.empty_like(at[0]))
-            edges.round(_draw, *at[-2:])
+        start = x.detach().reshape(-1, edges.count, 3)
+        at = start.new_empty(edges.rounds + 1, *start.shape)
+        at[0] = start
+        edges.launch(_draw, len(start), at)
         ctx.edges = edges
         if x.requires_grad or lengths.requires_grad:
-            ctx.save_for_backward(*at[:-1])
+            ctx.save_for_backward(at)
         return at[-1].view(x.shape)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor | None, None]:
         edges: EdgeProjection = ctx.edges
-        found = grads[0].reshape(-1, edges.count, 3).contiguous()
-        slope = torch.zeros_like(edges.lengths) if ctx.needs_input_grad[1] else None
-        for x in reversed(ctx.saved_tensors):
-            if slope is not None:
-                slope = slope + edges.lengths_slope(x, found)
-            found, before = torch.empty_like(found), found
-            edges.round(_draw_back, x, before, found)
-        return found.view(grads[0].shape), slope, None
+        (at,) = ctx.saved_tensors
+        found = torch.empty_like(at)
+        found[-1] = grads[0].reshape(at[-1].shape)
+        slope = at.new_zeros(at.shape[1], len(edges.lengths) if ctx.needs_input_grad[1] else 0)
+        edges.launch(_draw_back, at.shape[1], at, found, slope)
+        return found[0].view(grads[0].shape), slope.sum(0).to(edges.lengths) if slope.numel() else None, None
+
+
+@wp.struct
+class _Edges:
+    ends: wp.array(dtype=wp.vec2i)
+    lengths: wp.array(dtype=float)
+    share: wp.array(dtype=float)
 
 
 @wp.kernel
-def _draw(
-    starts: wp.array(dtype=int),
-    ends: wp.array(dtype=int),
-    share: wp.array(dtype=float),
-    lengths: wp.array(dtype=float),
-    x: wp.array(dtype=wp.vec3),
-    out: wp.array(dtype=wp.vec3),
-):
-    b, i = wp.tid()  # type: ignore[misc]
-    first = b * share.shape[0]
-    p = x[first + i]
-    move = wp.vec3()
-    for k in range(starts[i], starts[i + 1]):
-        away = p - x[first + ends[k]]
-        now = wp.length(away)
-        if now > 1.0e-9:
-            move += away * (1.0 - lengths[k] / now)
-    out[first + i] = p - move * share[i]
+def _draw(e: _Edges, at: wp.array3d(dtype=wp.vec3)):
+    # A drape is one thread: edges share vertices.
+    b = wp.tid()
+    for r in range(at.shape[0] - 1):
+        x, y = at[r, b], at[r + 1, b]
+        for i in range(x.shape[0]):
+            y[i] = x[i]
+        for k in range(e.lengths.shape[0]):
+            i = e.ends[k][0]
+            j = e.ends[k][1]
+            away = x[i] - x[j]
+            now = wp.length(away)
+            if now > 1.0e-9:
+                ask = away * (1.0 - e.lengths[k] / now)
+                y[i] = y[i] - ask * e.share[i]
+                y[j] = y[j] + ask * e.share[j]
 
 
 @wp.kernel
 def _draw_back(
-    starts: wp.array(dtype=int),
-    ends: wp.array(dtype=int),
-    share: wp.array(dtype=float),
-    lengths: wp.array(dtype=float),
-    x: wp.array(dtype=wp.vec3),
-    grad: wp.array(dtype=wp.vec3),
-    out: wp.array(dtype=wp.vec3),
+    e: _Edges, at: wp.array3d(dtype=wp.vec3), grad: wp.array3d(dtype=wp.vec3), slope: wp.array2d(dtype=float)
 ):
     # What an edge asks for changes with its ends by a symmetric matrix: (1 - L/l) I + (L/l) d d^T, d its direction.
-    b, i = wp.tid()  # type: ignore[misc]
-    first = b * share.shape[0]
-    p = x[first + i]
-    own = grad[first + i]
-    total = own
-    for k in range(starts[i], starts[i + 1]):
-        j = ends[k]
-        away = p - x[first + j]
-        now = wp.length(away)
-        if now > 1.0e-9:
-            ratio = lengths[k] / now
-            differ = own * share[i] - grad[first + j] * share[j]
-            along = away * (wp.dot(away, differ) / (now * now))
-            total = total - differ * (1.0 - ratio) - along * ratio
-    out[first + i] = total
-
-
-@wp.kernel
-def _lengths_back(
-    starts: wp.array(dtype=int),
-    ends: wp.array(dtype=int),
-    share: wp.array(dtype=float),
-    x: wp.array(dtype=wp.vec3),
-    grad: wp.array(dtype=wp.vec3),
-    out: wp.array(dtype=float),
-):
-    i = wp.tid()
-    for k in range(starts[i], starts[i + 1]):
-        away = x[i] - x[ends[k]]
-        now = wp.length(away)
-        if now > 1.0e-9:
-            out[k] = out[k] + wp.dot(grad[i], away) * (share[i] / now)
+    b = wp.tid()
+    for back in range(at.shape[0] - 1):
+        r = at.shape[0] - 2 - back
+        x, y, g = at[r, b], grad[r + 1, b], grad[r, b]
+        for i in range(x.shape[0]):
+            g[i] = y[i]
+        for k in range(e.lengths.shape[0]):
+            i = e.ends[k][0]
+            j = e.ends[k][1]
+            away = x[i] - x[j]
+            now = wp.length(away)
+            if now > 1.0e-9:
+                ratio = e.lengths[k] / now
+                differ = y[i] * e.share[i] - y[j] * e.share[j]
+                along = wp.dot(away, differ) / now
+                change = differ * (1.0 - ratio) + away * (along * ratio / now)
+                g[i] = g[i] - change
+                g[j] = g[j] + change
+                if slope.shape[1] > 0:
+                    slope[b, k] = slope[b, k] + along
