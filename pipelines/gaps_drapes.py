@@ -30,7 +30,9 @@ class Teaching:
     """How drapes are made and learned from."""
 
     windows: int = 400
-    """Windows of motion; 0 = the last layer stays as physics left it."""
+    """Windows of motion; 0 = the last layer stays as physics left it, and reads all states."""
+    fit: bool = True
+    """Whether drapes are made and the last layer learns them; False: it is only narrowed to ``rank``."""
     frames: int = 60
     """Frames of a window."""
     burn_in: int = 24
@@ -98,7 +100,8 @@ def drapes(draper: GapsDraper, motions: Sequence[Motion], body: Body, teaching: 
         if not file.is_file():
             generator = torch.Generator().manual_seed(first)
             count = min(CHUNK, teaching.windows - first)
-            many = [_window(draper, steps, motions, body, teaching, generator) for _ in range(count)]
+            drawn = [Window.drawn(motions, body, teaching, generator) for _ in range(count)]
+            many = [_window(draper, steps, w, body, Drapes.rows(teaching)) for w in drawn]
             kept.parent.mkdir(parents=True, exist_ok=True)
             whole = {f.name: torch.stack([w[f.name] for w in many]).contiguous() for f in fields(Drapes)}
             save_file(whole, file.with_suffix(".tmp"), {"made": told})
@@ -110,32 +113,42 @@ def drapes(draper: GapsDraper, motions: Sequence[Motion], body: Body, teaching: 
     return Drapes(**{f.name: torch.cat([c[f.name] for c in chunks]) for f in fields(Drapes)})
 
 
+@dataclass(frozen=True)
+class Window:
+    """A stretch of motion on a random body."""
+
+    features: Tensor
+    """(T, FEATURES)."""
+    shape: Tensor
+    """(S,)."""
+    pose: Tensor
+    """(R, 24, 3) of the frames to drape [rad]."""
+    place: Tensor
+    """(R, 3) [m]."""
+
+    @classmethod
+    def drawn(cls, motions: Sequence[Motion], body: Body, teaching: Teaching, generator: torch.Generator) -> Window:
+        """A random one."""
+        (pose, place), (arms, _) = (_stretch(motions, teaching, generator) for _ in range(2))
+        if torch.rand((), generator=generator) < teaching.swap:
+            pose = torch.where(ARMS[:, None], arms, pose)
+        factor = teaching.spread * torch.rand((), generator=generator)
+        shape = factor * torch.randn(body.n_shape, generator=generator).clamp(-2, 2)
+        features = motion_features(pose[None, 1:], place[None, 1:], motions[0].fps, (pose[None, 0], place[None, 0]))
+        rows = Drapes.rows(teaching)
+        return cls(features[0], shape, pose[1:][rows], place[1:][rows])
+
+
 @torch.no_grad()
-def _window(
-    draper: GapsDraper,
-    steps: Projective,
-    motions: Sequence[Motion],
-    body: Body,
-    teaching: Teaching,
-    generator: torch.Generator,
-) -> dict[str, Tensor]:
-    """One window, as the fields of ``Drapes``."""
-    (pose, place), (arms, _) = (_stretch(motions, teaching, generator) for _ in range(2))
-    if torch.rand((), generator=generator) < teaching.swap:
-        pose = torch.where(ARMS[:, None], arms, pose)
-    factor = teaching.spread * torch.rand((), generator=generator)
-    shape = factor * torch.randn(1, body.n_shape, generator=generator).clamp(-2, 2)
-    features = motion_features(pose[None, 1:], place[None, 1:], motions[0].fps, (pose[None, 0], place[None, 0]))
-    rows = Drapes.rows(teaching)
-    pose, place = pose[1:][rows], place[1:][rows]
-    moved = draper.net(features, shape)[0][0, rows]
-    posed = body.pose(BodyPose(shape.expand(len(rows), -1), pose, place))
+def _window(draper: GapsDraper, steps: Projective, window: Window, body: Body, rows: Tensor) -> dict[str, Tensor]:
+    """One window draped, as the fields of ``Drapes``."""
+    moved = draper.net(window.features[None], window.shape[None])[0][0, rows]
+    posed = body.pose(BodyPose(window.shape.expand(len(rows), -1), window.pose, window.place))
     guess = draper.placed(moved, posed.transforms, posed.shape)
     x = steps(guess, posed)
     normal, gap = steps.planes(x, posed)
     moved = moved + draper.bound.unposed(x - guess, posed.transforms)
-    half = {"moved": moved.half(), "normal": normal.half(), "gap": gap.half()}
-    return {"features": features[0], "shape": shape[0], "pose": pose, "place": place, **half}
+    return {**vars(window), "moved": moved.half(), "normal": normal.half(), "gap": gap.half()}
 
 
 def _stretch(motions: Sequence[Motion], teaching: Teaching, generator: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pipelines.gaps_drapes import Drapes, Teaching, drapes
+from pipelines.gaps_drapes import Drapes, Teaching, Window, drapes
 from pipelines.low_rank import low_rank
 from recon.bodies import Body
 from recon.cloth.energies import Cloth
@@ -32,14 +32,25 @@ DEEPEST = 0.02
 
 def taught(draper: GapsDraper, motions: Sequence[Motion], body: Body, teaching: Teaching, kept: Path) -> GapsNet:
     """The whole of it: draped, fitted, narrowed. ``kept`` as in :func:`drapes`; its files go at the end."""
+    rest = draper.garment if isinstance(draper.garment, Mesh) else draper.garment.mesh
+    if not teaching.fit:
+        return narrowed(draper.net, states_on(draper.net, motions, body, teaching), rest, teaching.rank)
     known = drapes(draper, motions, body, teaching, kept)
     problem = LinearMap.of(draper.net, known, teaching)
     net = refitted(draper.net, problem, unposed_planes(known, draper.bound, body), teaching)
-    rest = draper.garment if isinstance(draper.garment, Mesh) else draper.garment.mesh
     net = narrowed(net, problem.states[:, :-1], rest, teaching.rank)
     for file in kept.parent.glob(f"{kept.name}-*.safetensors"):
         file.unlink()
     return net
+
+
+@torch.no_grad()
+def states_on(net: GapsNet, motions: Sequence[Motion], body: Body, teaching: Teaching) -> Tensor:
+    """(N, W) states of a network on random windows."""
+    generator = torch.Generator().manual_seed(0)
+    many = [Window.drawn(motions, body, teaching, generator) for _ in range(teaching.windows)]
+    rows = Drapes.rows(teaching)
+    return torch.cat([net.remember(w.features[None], w.shape[None])[0][0, rows] for w in many])
 
 
 @dataclass

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipelines.gaps_drapes import Drapes, Teaching, drapes
-from pipelines.gaps_refit import LinearMap, narrowed, refitted, unposed_planes
+from pipelines.gaps_drapes import Drapes, Teaching, Window, drapes
+from pipelines.gaps_refit import LinearMap, narrowed, refitted, taught, unposed_planes
 from pipelines.low_rank import low_rank
 from pipelines.train_gaps import TrainGaps, train_gaps
 from recon.bodies import load_body
@@ -73,6 +73,15 @@ def test_drapes_lie_as_far_from_the_body_as_their_planes_say(draper, known, body
     far = torch.stack([BodyContact(b, body.faces).signed_distance(v) for b, v in zip(bodies, x)])
     error = (far - known.gap.flatten(0, 1).float()).abs()[near]
     assert float(error.median()) < 5e-4 and float(error.quantile(0.9)) < 3e-3
+
+
+def test_narrowed_alone_the_network_stays_what_it_was(draper, motion, body, tmp_path) -> None:
+    few = taught(draper, [motion], body, replace(SMALL, windows=20, rank=20, fit=False), tmp_path / "own")
+    window = Window.drawn([motion], body, SMALL, torch.Generator().manual_seed(5))
+    with torch.no_grad():
+        wide, narrow = (net(window.features[None], window.shape[None])[0] for net in (draper.net, few))
+    assert few.shape.rank == 20 and not list(tmp_path.iterdir())
+    assert (narrow - wide).norm() < 0.02 * (wide - wide.mean((0, 1))).norm()
 
 
 def test_drapes_are_kept_and_those_of_other_settings_refused(draper, motion, body, tmp_path) -> None:
