@@ -83,7 +83,7 @@ def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000, repeats:
     """Milliseconds a frame of a garment of ``vertices``, skeleton posed as well.
 
     One by one, without and with the body's own vertices, with projective steps too, and all frames at once (with the
-    body's vertices, without steps); the same of a last layer that reads all states, as before it is fitted to drapes;
+    body's vertices, without steps); the same of a last layer that reads all states, as before it is narrowed;
     and the CPU time of one frame.
     """
     shape = GapsShape(vertices, body.n_shape, rank=Teaching.rank, edge_rounds=TrainGaps.edge_rounds)
@@ -319,24 +319,27 @@ def _seconds(row: dict) -> str:
     return f"{row['seconds']} ({row['cpu_seconds']})" if "cpu_seconds" in row else str(row["seconds"])
 
 
+CELLS = """Cells: eps_e, eps_a, eps_c ± its deviation over the frames, in per cent. *With steps*: the network's
+drapes after projective steps (`recon.cloth.projective`: nothing learned, no state from frame to frame), which is what
+`recon animate` gives; they use the body's mesh. *Out*: frames in which a limb has left an opening of the garment (an arm
+its sleeve), in per cent; none where nothing is said. Limbs that pass through the body in the clip are turned out of it
+first (`recon.bodies.clearance`). Our networks end in two rounds of edge projection (`recon.cloth.edges`), learned
+through: part of the network and of its time."""
+BASELINES = """snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility and edge
+projection. noext: ours without inextensibility, kext1: its stretch factor is one under contact, too, noedges: ours
+without edge projection. No last layer is narrowed here."""
+
+
 def page(found: dict) -> str:
     """docs/results/gaps.md."""
     about = f"`python benchmarks/gaps.py` on {found['machine']}, {found['cores']} cores, {found['date']}."
     lines = ["# GAPS, solver and untangling, measured", ""]
     lines += [f"{about} Clip: {CLIP.stem}, which no network learned from."]
-    lines += ["Cells: eps_e, eps_a, eps_c ± its deviation over the frames, in per cent. *With steps*: the network's"]
-    lines += ["drapes after projective steps (`recon.cloth.projective`: nothing learned, no state from frame to"]
-    lines += [
-        "frame), which is what `recon animate` gives; they use the body's mesh. *Out*: frames in which a limb has"
-    ]
-    lines += ["left an opening of the garment (an arm its sleeve), in per cent; none where nothing is said. Limbs that"]
-    lines += ["pass through the body in the clip are turned out of it first (`recon.bodies.clearance`)."]
+    lines += [CELLS]
     lines += table("Table 1: the neutral body", found["table1"], True)
     if "baselines" in found:
         lines += table("Baselines and Table 2 in the same frame, as many steps each", found["baselines"], False)
-        lines += ["", "snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility."]
-        lines += ["noext: ours without it, kext1: its stretch factor is one under contact, too. No last layer is"]
-        lines += ["fitted to drapes here. So early, what inextensibility adds is within what garments differ by."]
+        lines += ["", BASELINES]
         data = sorted({row["card"]["data"] for row in found["baselines"].values()})
         lines += [f"Learned from: {'; '.join(data)}."]
     lines += [
@@ -355,7 +358,7 @@ def page(found: dict) -> str:
         f"{t['one_by_one']} ms a frame one by one, skeleton posed too ({t['with_body_mesh']} with the body's mesh,",
         f"{t['with_steps']} with projective steps as well);",
         f"{t['at_once']} ms all at once, mesh and all (garment of 5000 vertices).",
-        f"Of a last layer that reads all states, not fitted: {t['all_states']} and {t['all_states_at_once']} ms.",
+        f"Of a last layer that reads all states, not narrowed: {t['all_states']} and {t['all_states_at_once']} ms.",
         f"CPU time of these frames: {t['one_by_one_cpu']}, {t['at_once_cpu']}, {t['all_states_cpu']} and",
         f"{t['all_states_at_once_cpu']} ms ({t['threads']} threads; other work ran beside it).",
     ]
