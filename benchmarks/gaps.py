@@ -322,8 +322,8 @@ def _seconds(row: dict) -> str:
 CELLS = """Cells: eps_e, eps_a, eps_c ± its deviation over the frames, in per cent. *With steps*: the network's
 drapes after projective steps (`recon.cloth.projective`: nothing learned, no state from frame to frame), which is what
 `recon animate` gives; they use the body's mesh. *Out*: frames in which a limb has left an opening of the garment (an
-arm its sleeve), in per cent; none where nothing is said. Limbs that pass through the body in the clip are turned out of it
-first (`recon.bodies.clearance`). Our networks end in two rounds of edge projection (`recon.cloth.edges`), learned
+arm its sleeve), in per cent; none where nothing is said. Limbs that pass through the body in the clip are turned out of
+it first (`recon.bodies.clearance`). Our networks end in two rounds of edge projection (`recon.cloth.edges`), learned
 through: part of the network and of its time."""
 BASELINES = """snug: weights of the nearest vertex, ncs: weights smoothed; both without inextensibility and edge
 projection. noext: ours without inextensibility, kext1: its stretch factor is one under contact, too, noedges: ours
