@@ -54,11 +54,13 @@ FARTHEST = 0.1
 WAYS: tuple[dict[str, float | bool], ...] = (
     {},
     {"tuck": True},
-    {"stiffness": 0.2},
     {"curve": 0.3, "gap": 2e-3},
+    {"stiffness": 0.2},
     {"reach": 0.04},
 )
 """What the tries change: what one way leaves tangled another mostly does not, and none is the best for all."""
+BETWEEN = ("tuck", "reach")
+"""What of it says nothing of a single layer."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,9 @@ class Untangling:
     """Most rounds of each try; what ends clean mostly does in fewer."""
     tries: int = 5
     """Most tries, each from the start and in another of the ``WAYS``."""
+    enough: float = 0.005
+    """A clean end that changes edges by no more than this share on average is taken; after another, what tries are left
+    may find a better one."""
     body: float = 5e-4
     """Distance from the body that every vertex and face centre ends with [m]."""
     gap: float = 1e-3
@@ -95,6 +100,8 @@ class Untangled:
     """(V, 3) of each layer, as they came [m]."""
     crossings: int
     """Pairs of faces that passed through each other before it began."""
+    strain: float
+    """Mean change of the edges' lengths, as a share."""
     left: NDArray
     """(P, 2) pairs of faces that still do, faces counted through all layers; empty where it worked."""
     inside: int
@@ -122,12 +129,13 @@ def untangle(layers: Sequence[Mesh], body: Mesh | None = None, settings: Untangl
         The layers moved, and what is left. Layers that are clean come back as they were.
     """
     settings = settings or Untangling()
+    ways = [way for way in WAYS if len(layers) > 1 or not any(key in way for key in BETWEEN)]
     found: list[Untangled] = []
-    for way in WAYS[: max(1, settings.tries)]:
+    for way in ways[: max(1, settings.tries)]:
         found.append(_Tangle(layers, body, replace(settings, **way)).solve())
-        if found[-1].clean:
+        if found[-1].clean and found[-1].strain <= settings.enough:
             break
-    best = min(found, key=lambda u: (u.inside, len(u.left)))
+    best = min(found, key=lambda u: (u.inside, len(u.left), u.strain))
     return replace(best, rounds=sum(u.rounds for u in found))
 
 
@@ -156,7 +164,7 @@ class _Tangle:
         """Rounds until nothing is left, then back to where cloth was as far as that stays so."""
         found, lack = self.crossings(self.x), self._lack()
         before = len(self.crossings.pairs(found))
-        goal, lengths = self.x.copy(), self.lengths.copy()
+        goal, lengths = self.x.copy(), np.maximum(self.lengths, 1e-9)
         rounds = self._rounds(found, lack) if len(found) or lack.any() else 0
         found, lack = self.crossings(self.x), self._lack(fresh=True)
         if rounds and not len(found) and not lack.any():
@@ -166,7 +174,10 @@ class _Tangle:
             found, lack = self.crossings(self.x), self._lack(fresh=True)
         left, inside = self.crossings.pairs(found), int(lack.sum())
         layers = [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
-        return Untangled(layers, before, left, inside, rounds, self._notes(left, inside))
+        ends = self.x[self.edges]
+        strain = np.abs(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / lengths - 1)
+        notes = self._notes(left, inside)
+        return Untangled(layers, before, float(strain.mean()), left, inside, rounds, notes)
 
     def _rounds(self, found: NDArray, lack: NDArray) -> int:
         """How many it took; ends clean, or with the best before cloth was laid flat: films stretch, and in vain."""
