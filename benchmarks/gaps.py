@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from draping import tube
 
-from pipelines.gaps_drapes import Teaching
 from pipelines.sequence import led_in, measure, untangled
 from pipelines.train_gaps import TrainGaps
 from recon.bodies import Body, load_body
@@ -86,7 +85,7 @@ def time_per_frame(body: Body, frames: int = 120, vertices: int = 5000, repeats:
     body's vertices, without steps); the same of a last layer that reads all states, as before it is narrowed;
     and the CPU time of one frame.
     """
-    shape = GapsShape(vertices, body.n_shape, rank=Teaching.rank, edge_rounds=TrainGaps.edge_rounds)
+    shape = GapsShape(vertices, body.n_shape, rank=TrainGaps.rank, edge_rounds=TrainGaps.edge_rounds)
     net, wide = GapsNet(shape), GapsNet(replace(shape, rank=0))
     pose = torch.zeros(frames, 24, 3)
     pose[:, 16, 2] = torch.linspace(-1.2, 0, frames)

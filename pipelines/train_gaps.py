@@ -2,9 +2,9 @@
 
 Windows of motion, random shapes: the network's drapes are pulled towards rest by strain, bending, gravity, collision,
 inertia and the collision-aware inextensibility (GAPS Eq. 9-17). No simulated drapes are needed. The paper's baselines
-run in the same frame: SNUG's is ``--skinning nearest --inextensibility 0``, NCS' ``--skinning smoothed
---inextensibility 0``. At the end the last layer is fitted to the network's own drapes after projective steps
-(:mod:`pipelines.gaps_refit`; ``--teaching.windows 0``: it is not).
+run in the same frame: SNUG's is ``--skinning nearest --inextensibility 0 --edge-rounds 0``, NCS' ``--skinning smoothed
+--inextensibility 0 --edge-rounds 0``. At the end the last layer becomes two, the first of few units
+(:mod:`pipelines.low_rank`): less memory to read in each frame.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import torch
 from torch import Tensor
 
 from pipelines.drape_training import ARMS, CLIP_TERMS, HELD_OUT, read_motions
-from pipelines.gaps_drapes import Teaching
-from pipelines.gaps_refit import taught
 from pipelines.garment_source import load_garment
+from pipelines.low_rank import narrowed
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.cloth.contact import BodyContact
@@ -100,8 +99,8 @@ class TrainGaps:
     """Distance from the body at which collision begins [m]."""
     start: Path | None = None
     """Folder with weights of this name and garment to go on from; None begins anew."""
-    teaching: Teaching = Teaching()
-    """How the last layer learns from the network's own drapes at the end."""
+    rank: int = 96
+    """Drapes that the last layer mixes in the end; 0 = displacements straight from all states."""
     pin: float = 20.0
     """Stiffness that keeps a waistband where skinning has it [J/m² per vertex]."""
 
@@ -146,21 +145,20 @@ def train_gaps(config: TrainGaps) -> Path:
     template = Template.of(load_garment(config.garment), body)
     if not border_loops(template.mesh.faces.numpy()):
         raise UserError(f"{config.garment}: found a closed surface; wanted an open garment")
-    training = learn(template, motions, body, config)
+    loss = Loss(template, motions, body, config)
+    training = learn(loss)
     assert isinstance(training.module, GapsNet)
     net = training.module.folded()
-    if config.teaching.windows:
-        training.save()  # a run that is killed while it drapes need not learn again
-        bound = Bound.of(template.mesh.vertices, template.mesh.faces, body, config.skinning)
-        draper = GapsDraper(net, template.thing, bound)
-        net = taught(draper, motions, body, config.teaching, config.out / f"gaps-{config.name}.drapes")
+    if config.rank:
+        net = narrowed(net, loss.states(net), template.mesh, config.rank)
     file = store(net, template, body, config, training)
     training.checkpoint.unlink(missing_ok=True)
     return file
 
 
-def learn(template: Template, motions: list[Motion], body: Body, config: TrainGaps) -> Training:
+def learn(loss: Loss) -> Training:
     """The training itself."""
+    config, template, body = loss.config, loss.template, loss.body
     torch.manual_seed(config.seed)
     count = len(template.mesh.vertices)
     shape = GapsShape(count, body.n_shape, config.width, config.layers, edge_rounds=config.edge_rounds)
@@ -171,10 +169,9 @@ def learn(template: Template, motions: list[Motion], body: Body, config: TrainGa
             raise UserError(f"{config.start}: found a network of {known.shape}; wanted {shape}")
         net.take_over(known)
     adam = torch.optim.Adam(net.parameters(), config.rate, fused=True)
-    training = Training(f"gaps-{config.name}", net, adam, settings_of(config, ("teaching",)), config.out)
+    training = Training(f"gaps-{config.name}", net, adam, settings_of(config, ("rank",)), config.out)
     training.resume()
     generator = torch.Generator().manual_seed(config.seed + training.step)
-    loss = Loss(template, motions, body, config)
     # What was learned once has its schedule of stretch behind it.
     training.run(
         Budget(config.minutes, config.steps), lambda share: loss(net, 1.0 if config.start else share, generator)
@@ -236,12 +233,27 @@ class Loss:
             places.append(motion.translation[rows])
         return torch.stack(poses), torch.stack(places)
 
-    def __call__(self, net: GapsNet, share: float, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        """The loss of one random batch, and its terms per frame."""
+    @torch.no_grad()
+    def states(self, net: GapsNet, batches: int = 200) -> Tensor:
+        """(N, W) states of a network on random windows."""
+        generator = torch.Generator().manual_seed(self.config.seed)
+        many = (self._seen(generator) for _ in range(batches))
+        last = slice(self.config.burn_in, None)
+        return torch.cat([net.remember(features, shape)[0][:, last].flatten(0, 1) for _, _, features, shape in many])
+
+    def _seen(self, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Random windows on random bodies: pose and translation as ``windows``, features (W, B + F, FEATURES) and shape
+        (W, S)."""
         c = self.config
         pose, place = self.windows(generator)
         features = motion_features(pose[:, 1:], place[:, 1:], c.fps, (pose[:, 0], place[:, 0]))
         shape = torch.randn(c.windows, self.body.n_shape, generator=generator).clamp(-2, 2) * c.shape_spread
+        return pose, place, features, shape
+
+    def __call__(self, net: GapsNet, share: float, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        """The loss of one random batch, and its terms per frame."""
+        c = self.config
+        pose, place, features, shape = self._seen(generator)
         hidden = None
         if c.burn_in:  # hidden states as they are in the midst of a motion
             with torch.no_grad():

@@ -99,18 +99,6 @@ class Projective:
         found = [self._one(x, skin, b) for x, b in zip(guess, body.mesh.vertices, strict=True)]
         return torch.stack(found)
 
-    @torch.no_grad()
-    def planes(self, x: Tensor, body: PosedBody) -> tuple[Tensor, Tensor]:
-        """The body beside cloth (B, V, 3), as the steps see it: normals (B, V, 3), zero where it is out of reach or not
-        to be left, and distances (B, V) from these planes [m]."""
-        skin, normals, gaps = self._skin(body), [], []
-        for one, b in zip(x, body.mesh.vertices, strict=True):
-            self.x.numpy()[:] = one.cpu().double().numpy()
-            self._look(skin, skin.posed(b))
-            normals.append(torch.from_numpy(self.normal.numpy().copy()))
-            gaps.append(torch.from_numpy(((self.x.numpy() - self.point.numpy()) * self.normal.numpy()).sum(1)))
-        return torch.stack(normals).to(x), torch.stack(gaps).to(x)
-
     def _skin(self, body: PosedBody) -> _Skin:
         faces = body.mesh.faces
         if self._body is None or self._body.faces is not faces:

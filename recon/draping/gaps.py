@@ -187,16 +187,6 @@ class Bound:
         """Displacements (B, V, 3), joint transforms (B, 24, 4, 4), shapes (B, S) -> posed vertices (B, V, 3)."""
         return skin(self.shaped(shape) + moved, transforms, self.weights)
 
-    def unposed(self, moved: Tensor, transforms: Tensor) -> Tensor:
-        """Small moves (B, V, 3) of posed vertices -> moves in the unposed space that place them there.
-
-        Damped: where opposite turns blend to nothing, no finite move would.
-        """
-        turns = (self.weights @ transforms[:, :, :3, :3].flatten(2)).unflatten(-1, (3, 3))
-        back = turns.transpose(-1, -2)
-        damped = back @ turns + 1e-3 * torch.eye(3).to(turns)
-        return torch.linalg.solve(damped, back @ moved[..., None])[..., 0]
-
     def shaped(self, shape: Tensor) -> Tensor:
         """The template as wide as bodies of shape (B, S): (B, V, 3) [m]."""
         return shaped(self.rest, self.directions, shape)

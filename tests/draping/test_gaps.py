@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from pipelines.drape_training import read_motions
-from pipelines.gaps_drapes import Teaching
 from pipelines.sequence import Animate, animate
 from pipelines.train_gaps import Template, TrainGaps, train_gaps
 from recon.bodies import load_body
@@ -55,7 +54,7 @@ def trained(tmp_path_factory, motions: Path) -> tuple[Path, TrainGaps]:
     out = tmp_path_factory.mktemp("gaps")
     config = TrainGaps(
         "skirt:test:1", motions, name="mini", holdout=("march",), out=out, steps=6, threads=1, windows=2, width=32,
-        layers=2, modes=40, burn_in=3, teaching=Teaching(windows=0),
+        layers=2, modes=40, burn_in=3, rank=0,
     )  # fmt: skip
     train_gaps(config)
     return out, config
