@@ -67,7 +67,7 @@ class Size:
     resolution: int
     """Cells of the grid that garments are cut on."""
     tangled: int
-    """Cases of each first layer that go through untangling as well."""
+    """Outfits of each first layer whose two innermost layers go through untangling; a quarter of them with all five."""
 
 
 FULL, QUICK = Size(25, 4, 80, 8), Size(1, 2, 48, 0)
@@ -177,7 +177,7 @@ def _seed(kind: str, group: int) -> int:
 def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Layering, say) -> dict:
     """One of the two tables, each way."""
     ways: dict[str, list[np.ndarray]] = {"without": [], "forces": [], "with": []}
-    clean: list[dict] = []
+    clean: dict[str, list[dict]] = {"2": [], "5": []}
     for group in range(size.groups):
         seed = _seed(kind, group)
         garments = unseen_garments(kind, 1, size.resolution, seed) + unseen_garments("top", TOPS, size.resolution, seed)
@@ -191,8 +191,9 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
             }
         for way, layers in outcomes.items():
             ways[way].append(table(layers, posed, body))
-        if len(clean) < size.tangled:
-            clean.append(drawn_apart(outcomes["with"], posed, body))
+        for count, found in clean.items():
+            if len(found) < size.tangled // {"2": 1, "5": 4}[count]:
+                found.append(drawn_apart(outcomes["with"][: int(count)], posed, body))
         say(f"{kind}: outfit {group + 1} of {size.groups}")
     tables = {way: np.concatenate(found, 1) for way, found in ways.items()}
     figures: dict = {
@@ -206,8 +207,11 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
         for way, found in tables.items()
     }
     figures["cases"] = size.groups * size.bodies
-    if clean:
-        figures["untangled"] = {"cases": len(clean), "clean": sum(c["clean"] for c in clean), "each": clean}
+    figures["untangled"] = {
+        count: {"cases": len(found), "clean": sum(c["clean"] for c in found), "each": found}
+        for count, found in clean.items()
+        if found
+    }
     return figures
 
 
@@ -359,11 +363,8 @@ def page(figures: dict) -> str:
                     f"| {i + 1} | " + " | ".join(f"{v:.3f}" if j >= i else "" for j, v in enumerate(row)) + " |"
                 )
             lines.append("")
-        if "untangled" in t:
-            lines += [
-                f"After untangling nothing crosses in {t['untangled']['clean']} of {t['untangled']['cases']}.",
-                "",
-            ]
+        for count, u in (t.get("untangled") or {}).items():
+            lines += [f"{count} layers, untangled: nothing crosses in {u['clean']} of {u['cases']}.", ""]
     return "\n".join([*lines, *_curves(), CURVE]) + "\n"
 
 
