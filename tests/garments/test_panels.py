@@ -6,7 +6,7 @@ import pytest
 from recon.garments.chains import arc_lengths, chains_of, clean_runs, merge_parameters, pair_chains, without_slits
 from recon.garments.dataset import load_garments
 from recon.garments.panels import border_loops, cut_panel, grid_axis, move_safely, signed_areas, waistband
-from recon.garments.sewing import garment_loops, is_manifold, sew, split_chords
+from recon.garments.sewing import garment_loops, is_manifold, sew, split_chords, without_slivers
 
 TURNED = [False, True]
 
@@ -180,6 +180,18 @@ def test_chords_between_seam_points_are_split():
     assert len(f) == 4 and len(p) == 5 and labels[4] == -1
     np.testing.assert_allclose(signed_areas(p, f), 0.25)
     assert len(border_loops(f)) == 1
+
+
+def test_slivers_turn_their_long_edge_unless_it_is_a_border():
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.005], [0.5, -0.6], [0.5, 0.7]])
+    faces = np.array([[0, 1, 2], [1, 0, 3], [2, 1, 4], [0, 2, 4]])
+    found = without_slivers(points, faces)
+    assert {frozenset(f) for f in found.tolist()} == {
+        frozenset(f) for f in ((2, 0, 3), (2, 3, 1), (2, 1, 4), (0, 2, 4))
+    }
+    assert (signed_areas(points, found) > 0.1).all()
+    assert signed_areas(points, found).sum() == pytest.approx(signed_areas(points, faces).sum())
+    np.testing.assert_array_equal(without_slivers(points, faces[[0, 2, 3]]), faces[[0, 2, 3]])  # nothing lies across
 
 
 def test_chains_pair_by_label_and_place():
