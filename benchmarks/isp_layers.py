@@ -70,7 +70,7 @@ class Size:
     """Outfits of each first layer whose two innermost layers go through untangling; a quarter of them with all five."""
 
 
-FULL, QUICK = Size(25, 4, 80, 8), Size(1, 2, 48, 0)
+FULL, QUICK = Size(25, 4, 80, 4), Size(1, 2, 48, 0)
 
 
 def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> BodyPose:
