@@ -369,10 +369,10 @@ def page(figures: dict) -> str:
 
 
 CURVE = """Unseen garments on unseen bodies, strain to skinning's by D_s alone before there was edge projection,
-shorter trainings (on poses whose limbs may pass through the body) against longer ones: skirts .51 after 4 minutes and .36
-after 10, trousers .33 after 6 and .24 after 14, dresses .56 after 5 and .34 after 14: about the time to the power of
--0.4. With edge projection at the end, five outfits of dresses on four bodies: .26 after 14 minutes, .21 after 22; tops
-stayed at .24 with 8 minutes more. A tenth by D_s alone is hours of a core away; on a GPU it was not tried."""
+shorter trainings (on poses whose limbs may pass through the body) against longer ones: skirts .51 after 4 minutes
+and .36 after 10, trousers .33 after 6 and .24 after 14, dresses .56 after 5 and .34 after 14: about the time to the
+power of -0.4. With edge projection at the end, five outfits of dresses on four bodies: .26 after 14 minutes, .21 after
+22; tops stayed at .24 with 8 minutes more. A tenth by D_s alone is hours of a core away; on a GPU it was not tried."""
 
 
 def _curves() -> list[str]:
