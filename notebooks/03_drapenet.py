@@ -18,7 +18,6 @@
 
 # %%
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -33,7 +32,7 @@ from recon.files.weights import read_manifest
 from recon.garments.dataset import load_garments
 from recon.metrics import inside_pct
 from recon.render.shade import Look, orbit_camera, picture
-from recon.types import BodyPose, Mesh
+from recon.types import BodyPose, Garment, Mesh
 
 QUICK = os.environ.get("GARMENT_RECON_NOTEBOOK") == "quick"
 out = Path("out/notebook-drapenet")
@@ -86,7 +85,7 @@ show("outfit", upper, lower)
 
 # %%
 faces = top.mesh.faces
-half = replace(top, mesh=Mesh(top.mesh.vertices, faces[top.mesh.vertices[faces].mean(1)[:, 0] > 0]))
+half = Garment.bare("top", Mesh(top.mesh.vertices, faces[top.mesh.vertices[faces].mean(1)[:, 0] > 0]))
 with torch.no_grad():
     show("half", (m := draper.drape(half, posed)).with_vertices(m.vertices[0]))
     codes = torch.stack([draper.nets.code(g.mesh) for g in load_garments("top", "test")[:6]])

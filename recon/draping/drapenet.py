@@ -285,7 +285,7 @@ class DrapeNetDraper:
         self.nets = nets.eval().requires_grad_(False)
         self.skinning = SkinningDraper(body)
         self.chest = float(body.rest_joints(body.neutral().shape)[0, CHEST, 1])
-        self._last: tuple[Tensor, Known] | None = None
+        self._last: tuple[Mesh, Known] | None = None
 
     def group(self, garment: Garment) -> str:
         """The network that drapes a garment: by its kind, or for a bare mesh by whether it reaches the chest."""
@@ -296,12 +296,12 @@ class DrapeNetDraper:
     def known(self, garment: Garment) -> Known:
         """Skinning of a garment as the networks learned it, its code and edges; of the last one remembered."""
         mesh = garment.mesh
-        if self._last is None or self._last[0] is not mesh.vertices:
+        if self._last is None or self._last[0].vertices is not mesh.vertices or self._last[0].faces is not mesh.faces:
             edges = edge_layer(garment, EDGE_ROUNDS)
             found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), edges=edges)
             if mesh.vertices.requires_grad and torch.is_grad_enabled():
                 return found
-            self._last = mesh.vertices, found
+            self._last = mesh, found
         return self._last[1]
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:

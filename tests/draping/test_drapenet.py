@@ -22,7 +22,7 @@ from recon.draping.mlp import waves
 from recon.draping.rest_code import RestCode
 from recon.files.weights import write_weights
 from recon.garments.dataset import load_garments
-from recon.types import BodyPose, Mesh, UserError
+from recon.types import BodyPose, Garment, Mesh, UserError
 
 BODY = load_body()
 TOPS, TROUSERS = load_garments("top", "test"), load_garments("trousers", "test")
@@ -49,6 +49,14 @@ def test_shapes_and_any_mesh(nets):
         out = draper.drape(garment, body)
         assert out.vertices.shape == (2, len(garment.mesh.vertices), 3) and out.vertices.isfinite().all()
         assert out.faces is garment.mesh.faces
+
+
+def test_part_of_a_garment_is_known_as_another(nets):
+    draper, whole = DrapeNetDraper(nets, BODY), TOPS[0]
+    half = Garment.bare("top", Mesh(whole.mesh.vertices, whole.mesh.faces[: len(whole.mesh.faces) // 2]))
+    first, part = draper.known(whole), draper.known(half)
+    assert draper.known(half) is part and not torch.allclose(first.code, part.code)
+    assert draper.drape(half, posed()).vertices.isfinite().all()
 
 
 def test_weights_sum_to_one_and_field_is_of_points_alone(nets):
