@@ -359,7 +359,7 @@ def page(found: dict) -> str:
         f"{t['at_once']} ms all at once, mesh and all (garment of 5000 vertices).",
         f"Of a last layer that reads all states, not narrowed: {t['all_states']} and {t['all_states_at_once']} ms.",
         f"CPU time of these frames: {t['one_by_one_cpu']}, {t['at_once_cpu']}, {t['all_states_cpu']} and",
-        f"{t['all_states_at_once_cpu']} ms ({t['threads']} threads; other work ran beside it).",
+        f"{t['all_states_at_once_cpu']} ms ({t['threads']} threads).",
     ]
     lines += [
         "",
