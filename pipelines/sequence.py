@@ -41,7 +41,7 @@ from recon.types import BodyPose, Garment, Mesh, Motion, PosedBody, UserError
 
 DRAPERS = ("gaps", "simulate", "skinning")
 WRITERS = ("glb", "obj", "pc2", "gif", "mp4")
-ROUNDS, TRIES = 16, 3
+ROUNDS, TRIES = 30, 3
 """Most rounds and tries of untangling per frame: what has no room in one frame mostly has none in the next."""
 CHUNK = 20
 """Frames that are untangled between two times that this is kept."""
