@@ -163,7 +163,8 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
     """
     garment = load_garments("top", "test")[0]
     posed = body.pose(BodyPose(*(t[:1] for t in vars(unseen_bodies(2, body, 7)).values())))
-    found: dict = {"drape_ms": {}, "drape_ready_ms": {}}
+    found: dict = {"load": round(os.getloadavg()[0], 1), "threads": torch.get_num_threads()}
+    found |= {"drape_ms": {}, "drape_ready_ms": {}}
     found["encode_ms"] = _timed(lambda: draper.nets.code(garment.mesh), size.repeats)
     code = draper.nets.code(garment.mesh)
     for name, count in (("5k", 5_000), ("100k", 100_000)):
@@ -278,8 +279,7 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
         **{"code_ms" if k == "encode_ms" and decoder else k: v for k, v in times(size, body, draper).items()},
         "trained": {name: learned(p) for name, p in parts.items()},
         "size": vars(size),
-        "load": round(os.getloadavg()[0], 1),
-        "machine": f"{platform.machine()}, {torch.get_num_threads()} threads, torch {torch.__version__}",
+        "machine": f"{platform.machine()}, torch {torch.__version__}",
     }
 
 
@@ -317,7 +317,7 @@ def page(found: dict) -> str:
     lines[-1] += (
         f"{found['drape_ready_ms']} ms; the product's skinning and a code for a new garment of 3,446 vertices add "
         f"{found['bind_ms']} ms. Off the networks asked in full: {found['drape_off_mm']} mm in the mean. "
-        f"Load of the machine then: {found['load']} (two cores; above 2 it is too slow)."
+        f"Threads: {found['threads']}; load of the machine before: {found['load']} (two cores; above 2 it is too slow)."
     )
     return "\n".join(lines) + "\n"
 

@@ -51,7 +51,7 @@ class EdgeProjection:
         return cls(cloth.edges, cloth.edge_lengths, len(cloth.masses), rounds, held)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Drapes (..., V, 3) float32 [m] -> as many; differentiable in them and the lengths (once)."""
+        """Drapes (..., V, 3) [m] -> as many, computed in floats; differentiable in them and the lengths (once)."""
         return _Project.apply(x, self.lengths, self) if self.rounds else x
 
     def _floats(self, tensor: Tensor) -> wp.array:
@@ -66,14 +66,14 @@ class EdgeProjection:
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, lengths: Tensor, edges: EdgeProjection) -> Tensor:
-        start = x.detach().reshape(-1, edges.count, 3)
+        start = x.detach().float().reshape(-1, edges.count, 3)
         at = start.new_empty(edges.rounds + 1, *start.shape)
         at[0] = start
         edges.launch(_draw, len(start), at)
         ctx.edges = edges
         if x.requires_grad or lengths.requires_grad:
             ctx.save_for_backward(at)
-        return at[-1].view(x.shape)
+        return at[-1].view(x.shape).to(x.dtype)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor | None, None]:
@@ -83,7 +83,8 @@ class _Project(torch.autograd.Function):
         found[-1] = grads[0].reshape(at[-1].shape)
         slope = at.new_zeros(at.shape[1], len(edges.lengths) if ctx.needs_input_grad[1] else 0)
         edges.launch(_draw_back, at.shape[1], at, found, slope)
-        return found[0].view(grads[0].shape), slope.sum(0).to(edges.lengths) if slope.numel() else None, None
+        of_x = found[0].view(grads[0].shape).to(grads[0].dtype)
+        return of_x, slope.sum(0).to(edges.lengths) if slope.numel() else None, None
 
 
 @wp.struct

@@ -295,14 +295,15 @@ class DrapeNetDraper:
 
     def known(self, garment: Garment) -> Known:
         """Skinning of a garment as the networks learned it, its code and edges; of the last one remembered."""
-        mesh = garment.mesh
-        if self._last is None or self._last[0].vertices is not mesh.vertices or self._last[0].faces is not mesh.faces:
-            edges = edge_layer(garment, EDGE_ROUNDS)
-            found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), edges=edges)
-            if mesh.vertices.requires_grad and torch.is_grad_enabled():
-                return found
+        mesh, last = garment.mesh, self._last
+        asked = mesh.vertices.requires_grad and torch.is_grad_enabled()
+        if last and not asked and last[0].vertices is mesh.vertices and last[0].faces is mesh.faces:
+            return last[1]
+        edges = edge_layer(garment, EDGE_ROUNDS)
+        found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), edges=edges)
+        if not asked:
             self._last = mesh, found
-        return self._last[1]
+        return found
 
     def drape(self, garment: Garment, body: PosedBody, under: Sequence[Mesh] = ()) -> Mesh:
         """The garment on B bodies: Mesh with (B, N, 3) vertices; the layers beneath play no part (see ``outfit``)."""

@@ -209,12 +209,8 @@ class GapsDraper:
         """All frames of one motion at once: (F, V, 3) [m]. ``body``: the F posed bodies of ``pose``."""
         features = motion_features(pose.pose[None], pose.translation[None], fps)
         moved, _ = self.net(features, pose.shape[:1], self._warm(features[:, :1], pose.shape[:1]))
-        drapes = self.placed(moved[0], body.transforms, pose.shape)
+        drapes = self.edges(self.bound.place(moved[0], body.transforms, pose.shape))
         return self.projective(drapes, body) if self.projective else drapes
-
-    def placed(self, moved: Tensor, transforms: Tensor, shape: Tensor) -> Tensor:
-        """As ``Bound.place``, edges drawn to their lengths."""
-        return self.edges(self.bound.place(moved, transforms, shape))
 
     @torch.no_grad()
     def stream(self, frames: Iterable[BodyPose], body: Body, fps: float) -> Iterator[Tensor]:

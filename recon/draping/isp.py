@@ -2,9 +2,9 @@
 
 The network gives two displacement maps, front and back, for a pose, a shape and a garment; they are read at the points
 of the panels, averaged at the seams and added to the garment at rest before it is skinned; at the end a few rounds draw
-each edge towards its length (:mod:`recon.cloth.edges`). Its maps are sums of smooth
-cosines instead of the paper's N x N numbers, and it knows a garment by its rest maps' principal components instead of
-by a decoder's code: so it drapes whatever has panels of its kind, and still does when a decoder is trained anew.
+each edge towards its length (:mod:`recon.cloth.edges`). Its maps are sums of smooth cosines instead of the paper's
+N x N numbers, and it knows a garment by its rest maps' principal components instead of by a decoder's code: so it
+drapes whatever has panels of its kind, and still does when a decoder is trained anew.
 """
 
 from __future__ import annotations
@@ -146,6 +146,7 @@ class Worn:
     cells: tuple[int, int]
     """Nodes of a map along x and y."""
     edges: EdgeProjection
+    """What ends a drape."""
 
     @classmethod
     def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:

@@ -105,11 +105,8 @@ class _Growing:
         away = self.moved != self.panel.points
         moved = np.nonzero(away[:, 0] | away[:, 1])[0]
         points = move_safely(points, faces, moved, self.moved[moved])
-        return (
-            points,
-            without_slivers(points, faces),
-            np.concatenate([self.labels, np.array(self.new_labels, np.int64)]),
-        )
+        labels = np.concatenate([self.labels, np.array(self.new_labels, np.int64)])
+        return points, without_slivers(points, faces), labels
 
 
 def without_slivers(points: NDArray, faces: NDArray) -> NDArray:

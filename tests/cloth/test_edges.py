@@ -60,6 +60,14 @@ def test_lengths_come_nearer_with_each_round_and_right_ones_stay() -> None:
     assert (EdgeProjection.of(CLOTH, 4)(flat) - flat).abs().max() < 1e-6
 
 
+def test_doubles_come_back_as_doubles() -> None:
+    x = crumpled(0.004).double().requires_grad_()
+    y = EdgeProjection.of(CLOTH, 2)(x)
+    y.sum().backward()
+    assert y.dtype == torch.float64 and x.grad is not None and x.grad.dtype == torch.float64
+    torch.testing.assert_close(y.float(), EdgeProjection.of(CLOTH, 2)(x.detach().float()))
+
+
 def test_a_stretched_triangle_shrinks_as_computed_by_hand() -> None:
     corners = torch.tensor([[1.0, 0, 0], [-0.5, 0.75**0.5, 0], [-0.5, -(0.75**0.5), 0]])
     cloth = Cloth.from_mesh(Mesh(corners, torch.tensor([[0, 1, 2]])))

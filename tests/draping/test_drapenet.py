@@ -57,6 +57,11 @@ def test_part_of_a_garment_is_known_as_another(nets):
     first, part = draper.known(whole), draper.known(half)
     assert draper.known(half) is part and not torch.allclose(first.code, part.code)
     assert draper.drape(half, posed()).vertices.isfinite().all()
+    asked = Garment.bare("top", Mesh(whole.mesh.vertices.clone().requires_grad_(), whole.mesh.faces))
+    with torch.no_grad():
+        draper.known(asked)
+    edges = draper.known(asked).edges  # what was remembered without a gradient is not given out for one
+    assert edges is not None and edges.lengths.requires_grad
 
 
 def test_weights_sum_to_one_and_field_is_of_points_alone(nets):
