@@ -39,10 +39,10 @@ from isp_layers import ROOT, unseen_bodies
 
 from recon.bodies import Body, load_body
 from recon.cloth.contact import BodyContact
-from recon.cloth.edges import EdgeProjection
 from recon.cloth.energies import Cloth, bending, gravity, stvk
-from recon.draping.drapenet import EDGE_ROUNDS, DrapeNetDraper, DrapeNets, Known, load_drapenet
-from recon.draping.dress import dress, edge_layer
+from recon.draping.drapenet import DrapeNetDraper, DrapeNets, Known, load_drapenet
+from recon.draping.dress import dress
+from recon.draping.ending import Ending
 from recon.draping.layering import Beneath
 from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
@@ -172,21 +172,22 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
         x = garment.mesh.vertices[pick] + 1e-3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
         mesh = Mesh(x, tube(count // 50, 50).faces)
         made = draper.nets.prepare(mesh, "top", code=code)
-        known = Known(None, code, edges=EdgeProjection.of(Cloth.from_mesh(mesh), EDGE_ROUNDS))
+        ending = Ending.of(Garment.bare("", mesh), draper.skinning.surface)
+        known = Known(None, code, ending=ending)
 
         def anew(mesh=mesh, known=known) -> torch.Tensor:
             return draper.nets.draped(mesh, "top", posed, known)
 
-        def again(made=made, known=known) -> torch.Tensor:
-            return known.edges(made.place(made.moved(draper.nets, "top", posed), posed))
+        def again(made=made, ending=ending) -> torch.Tensor:
+            return ending(made.place(made.moved(draper.nets, "top", posed), posed), posed)
 
         found["drape_ms"][name] = _timed(anew, size.repeats)
         found["drape_ready_ms"][name] = _timed(again, size.repeats)
     found["drape_off_mm"] = off_mm(draper.nets, garment.mesh, posed, Known(None, code))
 
     def bound() -> Known:
-        edges = edge_layer(garment, EDGE_ROUNDS)
-        return Known(draper.nets.bound(garment.mesh, draper.skinning), draper.nets.code(garment.mesh), edges=edges)
+        bound, code = draper.nets.bound(garment.mesh, draper.skinning), draper.nets.code(garment.mesh)
+        return Known(bound, code, ending=Ending.of(garment, draper.skinning.surface))
 
     found["bind_ms"] = _timed(bound, size.repeats)
     return found

@@ -72,6 +72,8 @@ class TrainDrapeIsp:
     """Units of each layer."""
     depth: int = 4
     """Layers before the last."""
+    rounds: int = 12
+    """Rounds that end a drape: half of the product's, for edges about twice as long."""
     collision: float = 2e4
     """Stiffness of contact with the body [J/m³ per vertex]."""
     usual: float = 0.2
@@ -120,7 +122,7 @@ class Loss:
         skinning = SkinningDraper(body)
         torch.manual_seed(config.seed)
         self.net = self._made(skinning)
-        self.worn = [Worn.of(g, self.net, skinning) for g in self.wardrobe.garments]
+        self.worn = [Worn.of(g, self.net, skinning, config.rounds) for g in self.wardrobe.garments]
 
     def _made(self, skinning: SkinningDraper) -> DisplacementNet:
         """The network, knowing box, joints and codes of the garments."""
@@ -154,7 +156,7 @@ class Loss:
         for k in torch.randperm(len(self.worn), generator=generator)[: c.worn].tolist():
             worn = self.worn[k]
             moved = worn.displaced(self.net(body.transforms, body.shape, worn.code))
-            x = worn.bound.place(moved, body.transforms, body.shape)
+            x = worn.placed(moved, body)
             energy, terms = self.wardrobe.physics[k](x)
             off = moved[:, self.wardrobe.held[k]].square().sum((1, 2))
             # Tight clothes on large bodies store many times the energy of others, and would be all that is learned.

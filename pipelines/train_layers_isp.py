@@ -173,8 +173,7 @@ class Loss:
 
     def _drape(self, k: int, body: PosedBody) -> Tensor:
         worn, net = self.worn[k], self.draper.nets[self.wardrobe.garments[k].kind]
-        moved = worn.displaced(net(body.transforms, body.shape, worn.code))
-        return worn.bound.place(moved, body.transforms, body.shape)
+        return worn.placed(worn.displaced(net(body.transforms, body.shape, worn.code)), body)
 
     def _beneath(self, body: PosedBody, skin: list[Beneath], generator: torch.Generator) -> list[Beneath]:
         """A random layer, every other one blown up."""

@@ -21,9 +21,8 @@ from torch import Tensor, nn
 
 from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
-from recon.cloth.edges import EdgeProjection
 from recon.draping.body_field import JOINTS, BodyFieldNet
-from recon.draping.dress import edge_layer
+from recon.draping.ending import Ending
 from recon.draping.isp import pose_features
 from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
 from recon.draping.nodes import Nodes
@@ -40,8 +39,6 @@ NODE_WIDTH = 0.0125
 """Distance of the nodes at which a fine mesh asks the networks [m]: draped vertices are 0.3 mm off in the mean."""
 MANY = 20_000
 """Meshes of more vertices than this may be finer than the nodes."""
-EDGE_ROUNDS = 4
-"""Rounds of edge projection that end a drape, as those of D_s (:mod:`recon.draping.isp`)."""
 FEW = 8
 """Up to so many bodies a garment is draped at once, and not made ready first."""
 
@@ -166,7 +163,7 @@ class Known:
     """(z,)."""
     above: Tensor | None = None
     """(z,) code of the garment over it, for the solver."""
-    edges: EdgeProjection | None = None
+    ending: Ending | None = None
     """What ends a drape; None: nothing."""
 
 
@@ -227,14 +224,13 @@ class DrapeNets(nn.Module):
         return Prepared(x, weights, directions, matrix, code, solved, nodes, shape_nodes)
 
     def draped(self, mesh: Mesh, group: str, body: PosedBody, known: Known) -> Tensor:
-        """A mesh at rest on B bodies -> (B, N, 3): what ``prepare``, ``moved`` and ``place`` give, edges drawn to their
-        lengths.
+        """A mesh at rest on B bodies -> (B, N, 3): what ``prepare``, ``moved`` and ``place`` give, and its ending.
 
         For few bodies (``FEW``), where nobody asks for gradients and ``exact`` is not set, shape and pose are folded
         into the networks, which are asked as ``prepare`` says: sooner, and the same up to roundings (0.1 mm).
         """
         x = self._draped(mesh, group, body, known)
-        return x if known.edges is None else known.edges(x)
+        return x if known.ending is None else known.ending(x, body)
 
     def _draped(self, mesh: Mesh, group: str, body: PosedBody, known: Known) -> Tensor:
         x, above = mesh.vertices, known.above
@@ -299,8 +295,8 @@ class DrapeNetDraper:
         asked = mesh.vertices.requires_grad and torch.is_grad_enabled()
         if last and not asked and last[0].vertices is mesh.vertices and last[0].faces is mesh.faces:
             return last[1]
-        edges = edge_layer(garment, EDGE_ROUNDS)
-        found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), edges=edges)
+        ending = Ending.of(garment, self.skinning.surface)
+        found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), ending=ending)
         if not asked:
             self._last = mesh, found
         return found

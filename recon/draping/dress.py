@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from recon.bodies import Body
 from recon.cloth.constraints import Constraints
-from recon.cloth.edges import EdgeProjection
-from recon.cloth.energies import Cloth, rest_edges
+from recon.cloth.energies import Cloth
 from recon.cloth.xpbd import Carry, Settings, carry
 from recon.draping import Draper
 from recon.garments import WAISTED
@@ -59,12 +58,6 @@ def held_vertices(garment: Garment | Mesh) -> NDArray:
     if isinstance(garment, Garment) and garment.kind in WAISTED:
         return waistband(garment)
     return np.zeros(0, np.int64)
-
-
-def edge_layer(garment: Garment, rounds: int) -> EdgeProjection:
-    """Edge projection of a garment whose waistband stays; its lengths carry gradients to panels and vertices."""
-    count = len(garment.mesh.vertices)
-    return EdgeProjection(*rest_edges(garment), count, rounds, torch.as_tensor(held_vertices(garment)))
 
 
 @torch.no_grad()

@@ -1,10 +1,10 @@
 """Draping by ISP's displacement network D_s: skinning, corrected by a learned map over the panels (ISP §3.2, Eq. 7-8).
 
 The network gives two displacement maps, front and back, for a pose, a shape and a garment; they are read at the points
-of the panels, averaged at the seams and added to the garment at rest before it is skinned; at the end a few rounds draw
-each edge towards its length (:mod:`recon.cloth.edges`). Its maps are sums of smooth cosines instead of the paper's
-N x N numbers, and it knows a garment by its rest maps' principal components instead of by a decoder's code: so it
-drapes whatever has panels of its kind, and still does when a decoder is trained anew.
+of the panels, averaged at the seams and added to the garment at rest before it is skinned; at the end some rounds draw
+edges to their lengths and cloth out of the body (:mod:`recon.draping.ending`). Its maps are sums of smooth cosines
+instead of the paper's N x N numbers, and it knows a garment by its rest maps' principal components instead of by a
+decoder's code: so it drapes whatever has panels of its kind, and still does when a decoder is trained anew.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from recon.bodies.rig import PARENTS
-from recon.cloth.edges import EdgeProjection
-from recon.draping.dress import edge_layer
+from recon.draping.ending import ROUNDS, Ending
 from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, rest_features
@@ -35,9 +34,6 @@ FARTHEST = 1.0
 they were there: beyond, the network guesses (a wide jacket strained to six times skinning's)."""
 KEPT = 4
 """So many garments stay prepared."""
-EDGE_ROUNDS = 4
-"""Rounds of edge projection that end a drape. They are not learned through: on the coarse garments that D_s learns on
-they would reach further than on the fine ones that it drapes."""
 
 
 @dataclass(frozen=True)
@@ -145,12 +141,11 @@ class Worn:
     code: Tensor
     cells: tuple[int, int]
     """Nodes of a map along x and y."""
-    edges: EdgeProjection
-    """What ends a drape."""
+    ending: Ending
 
     @classmethod
-    def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper) -> Worn:
-        """Bind, read the rest maps, and find the panel points' places on the displacement maps."""
+    def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper, rounds: int = ROUNDS) -> Worn:
+        """Bind, read the rest maps, find the panel points' places on the displacement maps; ``rounds`` end a drape."""
         box = net.shape.box
         rows, shares = around(box, map_size(box), garment.panel_points.to(net.mean), garment.side_of_point)
         weights, directions = skinning.bind(garment.mesh.vertices, garment.mesh.faces)
@@ -162,7 +157,7 @@ class Worn:
             Welding.of(garment),
             net.code(garment),
             map_size(box),
-            edge_layer(garment, EDGE_ROUNDS),
+            Ending.of(garment, skinning.surface, rounds),
         )
 
     @cached_property
@@ -184,6 +179,10 @@ class Worn:
         nodes = maps.flatten(2).flatten(0, 1).T.contiguous()
         at_points = (nodes[self.rows] * self.shares[..., None]).sum(1)
         return self.welding(at_points.unflatten(1, (-1, 3)).transpose(0, 1))
+
+    def placed(self, moved: Tensor, body: PosedBody) -> Tensor:
+        """Displacements (B, V, 3) [m] of the garment at rest -> where it is on B bodies (B, V, 3)."""
+        return self.ending(self.bound.place(moved, body.transforms, body.shape), body)
 
 
 class IspDraper:
@@ -227,8 +226,7 @@ class IspDraper:
         Differentiable in the garment's vertices and panels and in the body's shape, pose and translation.
         """
         worn, net = self.prepare(garment), self.nets[garment.kind]
-        moved = worn.displaced(net(body.transforms, body.shape, worn.code))
-        return Mesh(worn.edges(worn.bound.place(moved, body.transforms, body.shape)), garment.mesh.faces)
+        return Mesh(worn.placed(worn.displaced(net(body.transforms, body.shape, worn.code)), body), garment.mesh.faces)
 
 
 def load_isp_draper(body, folder: str | Path | None = None, kinds: Sequence[str] | None = None) -> IspDraper:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 from torch import Tensor
 
 from recon.bodies.skin import shaped, skin
+from recon.cloth.beside import Surface
 from recon.draping.binding import JOINTS, METHODS, BodyField, settle
 from recon.draping.lattice import Lattice
 from recon.types import Garment, Mesh, PosedBody
@@ -31,6 +33,13 @@ class SkinningDraper:
         self.method = method
         self._use_lattice = lattice and method == "rbf"
         self._lattice: Lattice | None = None
+        self._body = body
+
+    @cached_property
+    def surface(self) -> Surface:
+        """The neutral body's at rest, to walk on."""
+        rest = self._body.rest(self._body.neutral().shape)
+        return Surface(rest.vertices[0], rest.faces)
 
     def bind(self, vertices: Tensor, faces: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Rest vertices (N, 3) -> skinning weights (N, 24), rows sum to 1, and shape directions (N, 3, S)."""

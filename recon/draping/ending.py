@@ -1,0 +1,40 @@
+"""What ends a network's drape: rounds in which edges are drawn to their lengths and vertices out of the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from recon.cloth.beside import Surface
+from recon.cloth.edges import EdgeProjection
+from recon.cloth.energies import rest_edges
+from recon.draping.dress import held_vertices
+from recon.types import Garment, PosedBody
+
+ROUNDS = 24
+"""Rounds that end a drape; on the coarse garments that networks learn on, half as many reach as far."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The rounds for one garment; its waistband stays where the network has it."""
+
+    edges: EdgeProjection
+    surface: Surface
+    """The body's."""
+    start: Tensor
+    """(V,) the body's vertices that are nearest to the garment's at rest."""
+
+    @classmethod
+    def of(cls, garment: Garment, surface: Surface, rounds: int = ROUNDS) -> Ending:
+        """Lengths are the panels', or without panels the mesh's at rest; differentiable in either."""
+        rest = garment.mesh.vertices
+        held = torch.as_tensor(held_vertices(garment))
+        edges = EdgeProjection(*rest_edges(garment), len(rest), rounds, held)
+        return cls(edges, surface, surface.nearest_at_rest(rest))
+
+    def __call__(self, x: Tensor, body: PosedBody) -> Tensor:
+        """Drapes (B, V, 3) [m] on B bodies -> as many; differentiable in them, in the garment and in the bodies."""
+        return self.edges(x, self.surface.beside(body.mesh.vertices, self.start))
