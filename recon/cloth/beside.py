@@ -55,7 +55,7 @@ class Surface:
 
 
 class Beside:
-    """Says planes (``recon.cloth.edges.Planes``) as often as it is asked; walks go on from where the last ones ended."""
+    """Says planes (``recon.cloth.edges.Planes``) whenever it is asked; walks go on from where the last ones ended."""
 
     def __init__(self, surface: Surface, body: Tensor, start: Tensor):
         self.surface, self.body = surface, body
@@ -74,7 +74,7 @@ class Beside:
 
 
 def rings_of(faces: NDArray, count: int) -> NDArray:
-    """(count, R, 2) int32: for each vertex the other two corners of its faces, in their order; -1 where there are less."""
+    """(count, R, 2) int32: for each vertex the other corners of its faces, in their order; -1 where there are less."""
     corner = np.concatenate([faces, faces[:, [1, 2, 0]], faces[:, [2, 0, 1]]])
     corner = corner[np.argsort(corner[:, 0], kind="stable")]
     degree = np.bincount(corner[:, 0], minlength=count)
@@ -95,12 +95,10 @@ def spread(points: NDArray, count: int) -> NDArray:
 
 
 @wp.func
-def _descend(
-    rings: wp.array2d(dtype=wp.vec2i), body: wp.array2d(dtype=wp.vec3), b: int, start: int, p: wp.vec3
-) -> int:
+def _descend(rings: wp.array2d(dtype=wp.vec2i), body: wp.array2d(dtype=wp.vec3), b: int, start: int, p: wp.vec3) -> int:
     here = int(start)
     best = float(wp.length_sq(body[b, start] - p))
-    last = int(-1)
+    last = int(-1)  # noqa: UP018 - the same
     while here != last:
         last = int(here)
         for k in range(rings.shape[1]):
