@@ -45,13 +45,19 @@ class Surface:
         return torch.as_tensor(found.astype(np.int32), device=x.device)
 
     def beside(self, body: Tensor, start: Tensor) -> Beside:
-        """Planes for a garment whose walks start at ``start`` (V,), on bodies (B, N, 3)."""
+        """Planes for a garment whose walks start at ``start`` (V,), on bodies (B, N, 3).
+
+        Raises:
+            ValueError: bodies of another topology.
+        """
+        if body.dim() != 3 or body.shape[1] != len(self._rings):
+            raise ValueError(f"body: found vertices {tuple(body.shape)}; wanted (B, {len(self._rings)}, 3)")
         return Beside(self, body, start)
 
     def _walk(self, body: Tensor, x: Tensor, near: Tensor, normal: Tensor, first: bool) -> None:
         views: list[Any] = [wp.from_torch(t, dtype=wp.vec3) for t in (body, x, normal)]
         given = [self._rings, self._marks, *views, wp.from_torch(near), int(first)]
-        wp.launch(_walk, tuple(near.shape), inputs=given, device=self.device)
+        wp.launch(_walk, near.numel(), inputs=given, device=self.device)
 
 
 class Beside:
@@ -59,12 +65,18 @@ class Beside:
 
     def __init__(self, surface: Surface, body: Tensor, start: Tensor):
         self.surface, self.body = surface, body
-        self.near = start.expand(len(body), -1).contiguous()
+        self.near = start.repeat(len(body), 1)
         self.seen = body.detach().float().contiguous()
         self.first = True
 
     def __call__(self, x: Tensor) -> Planes:
-        """(B, V, 3) [m] -> points, differentiable in the body's vertices, and normals, which are not."""
+        """(B, V, 3) [m] -> points, differentiable in the body's vertices, and normals, which are not.
+
+        Raises:
+            ValueError: not as many garments as bodies.
+        """
+        if x.shape[:2] != self.near.shape:
+            raise ValueError(f"garment: found vertices {tuple(x.shape)}; wanted {(*self.near.shape, 3)}")
         x = x.contiguous()
         normal = torch.empty_like(x)
         self.surface._walk(self.seen, x, self.near, normal, self.first)
@@ -122,7 +134,9 @@ def _walk(
     near: wp.array2d(dtype=int),
     first: int,
 ):
-    b, i = wp.tid()
+    t = wp.tid()
+    b = t // near.shape[1]
+    i = t - b * near.shape[1]
     p = x[b, i]
     at = _descend(rings, body, b, near[b, i], p)
     if first > 0:

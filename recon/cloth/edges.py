@@ -71,15 +71,16 @@ class EdgeProjection:
         """With the lengths of a cloth."""
         return cls(cloth.edges, cloth.edge_lengths, len(cloth.masses), rounds, held)
 
-    def __call__(self, x: Tensor, beside: Callable[[Tensor], Planes] | None = None) -> Tensor:
+    def __call__(self, x: Tensor, beside: Callable[[Tensor], Planes] | None = None, look: int = LOOK) -> Tensor:
         """Drapes -> as many, computed in floats; differentiable (once) in them, the lengths and the planes' points.
 
         Args:
             x: (..., V, 3) [m]; B of them with ``beside``.
             beside: says the planes above which vertices (B, V, 3) should be, as often as it is asked.
+            look: rounds between two times.
         """
         now = before = x.float().reshape(-1, self.count, 3)
-        step = LOOK if beside else max(len(self.momentum), 1)
+        step = look if beside else max(len(self.momentum), 1)
         for k in range(0, len(self.momentum), step):
             planes = beside(now.detach()) if beside else (now.new_zeros(0, 0, 3),) * 2
             before, now = _Project.apply(before, now, self.lengths, *planes, self, self.momentum[k : k + step])

@@ -1,4 +1,7 @@
-"""What ends a network's drape: rounds in which edges are drawn to their lengths and vertices out of the body."""
+"""What ends a network's drape: rounds in which edges are drawn to their lengths and vertices out of what lies beneath.
+
+That is the body for a garment draped alone, and body and garments for one that is layered over them.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,18 @@ from recon.cloth.beside import Surface
 from recon.cloth.edges import EdgeProjection
 from recon.cloth.energies import rest_edges
 from recon.draping.dress import held_vertices
-from recon.types import Garment, PosedBody
+from recon.types import Garment, Mesh, PosedBody
 
 ROUNDS = 24
 """Rounds that end a drape; on the coarse garments that networks learn on, half as many reach as far."""
+
+
+def edges_of(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
+    """Edge projection of a garment whose waistband stays; of a mesh without panels with the lengths that it has."""
+    if isinstance(garment, Mesh):
+        garment = Garment.bare("", garment)
+    held = torch.as_tensor(held_vertices(garment))
+    return EdgeProjection(*rest_edges(garment), len(garment.mesh.vertices), rounds, held)
 
 
 @dataclass(frozen=True)
@@ -30,10 +41,7 @@ class Ending:
     @classmethod
     def of(cls, garment: Garment, surface: Surface, rounds: int = ROUNDS) -> Ending:
         """Lengths are the panels', or without panels the mesh's at rest; differentiable in either."""
-        rest = garment.mesh.vertices
-        held = torch.as_tensor(held_vertices(garment))
-        edges = EdgeProjection(*rest_edges(garment), len(rest), rounds, held)
-        return cls(edges, surface, surface.nearest_at_rest(rest))
+        return cls(edges_of(garment, rounds), surface, surface.nearest_at_rest(garment.mesh.vertices))
 
     def __call__(self, x: Tensor, body: PosedBody) -> Tensor:
         """Drapes (B, V, 3) [m] on B bodies -> as many; differentiable in them, in the garment and in the bodies."""

@@ -19,6 +19,8 @@ from torch import Tensor, nn
 
 from recon.cloth.constraints import open_rim
 from recon.cloth.contact import BodyContact
+from recon.cloth.edges import OFFSET, Planes
+from recon.draping.ending import edges_of
 from recon.draping.uv import FLAT_SCALE, Welding
 from recon.files.weights import read_weights
 from recon.types import Garment, Mesh, UserError
@@ -44,6 +46,9 @@ CHANNELS = 26
 """Of a map: presence, force, strain, curvature and place at rest, for both panels."""
 FORCE_SCALE = 100.0
 """Brings forces [m] to about one."""
+SETTLING, LOOK = 8, 4
+"""Rounds of edge projection that end the layering of a garment, and after how many it looks again at what is below:
+with twice as many, five layers come no further apart."""
 
 
 def vertex_normals(x: Tensor, faces: Tensor) -> Tensor:
@@ -283,7 +288,11 @@ class LayeringNet(nn.Module):
 
 
 class Layering:
-    """Algorithm 1: any number of garments, draped one by one, layered over each other."""
+    """Algorithm 1: any number of garments, draped one by one, layered over each other.
+
+    Each is moved off all that lies beneath it, one after another, and ends in a few rounds of edge projection: cloth
+    that was pushed out is stretched, and pushed into one layer by the next.
+    """
 
     def __init__(self, net: LayeringNet | None):
         """``net``: D_m; None: forces alone move the layers."""
@@ -309,15 +318,41 @@ class Layering:
             drapes: each alone on the same B bodies, (B, V, 3).
             body: (B, N, 3), where the body itself shall count as the layer beneath all.
         """
-        rasters = [Raster.of(g) if isinstance(g, Garment) else None for g in garments]
-        done = list(drapes)
-        for i in range(-1 if body is not None else 0, len(done) - 1):
-            layer = body if i < 0 else done[i]
-            assert layer is not None
-            beneath = Beneath.all_of(layer)
-            for j in range(i + 1, len(done)):
-                done[j] = self.over(rasters[j], done[j], beneath)
+        below = [Beneath.all_of(body)] if body is not None else []
+        done = list[Mesh]()
+        for garment, drape in zip(garments, drapes, strict=True):
+            raster = Raster.of(garment) if isinstance(garment, Garment) else None
+            moved = drape
+            for layer in below:
+                moved = self.over(raster, moved, layer)
+            if moved is not drape:
+                moved = settled(garment, moved, below)
+            done.append(moved)
+            below.append(Beneath.all_of(moved))
         return done
+
+
+def settled(garment: Garment | Mesh, outer: Mesh, below: Sequence[Sequence[Beneath]]) -> Mesh:
+    """A garment (B, V, 3) that was moved off the layers below, edges drawn to their lengths again above them all."""
+
+    def planes(x: Tensor) -> Planes:
+        normals = vertex_normals(x, outer.faces)
+        found = [_deepest([layer[b] for layer in below], x[b], normals[b]) for b in range(len(x))]
+        points, out = (torch.stack(part) for part in zip(*found, strict=True))
+        return points + (MARGIN - OFFSET) * out, out
+
+    return outer.with_vertices(edges_of(garment, SETTLING)(outer.vertices, planes, LOOK))
+
+
+def _deepest(layers: Sequence[Beneath], x: Tensor, normals: Tensor) -> Planes:
+    """Of the layers' surfaces beside points (V, 3) the one that each is deepest beneath: point, normal or none."""
+    found = [layer.closest(x, normals) for layer in layers]
+    on, out = (torch.stack([f[k] for f in found]) for k in (0, 1))
+    counts = torch.stack([f[2] for f in found])
+    depth = torch.where(counts, ((on - x) * out).sum(-1), -torch.inf)
+    which = depth.argmax(0)
+    each = torch.arange(len(x))
+    return on[which, each], out[which, each] * counts[which, each, None]
 
 
 def load_layering(folder: str | Path | None = None) -> Layering:

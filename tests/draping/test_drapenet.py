@@ -60,8 +60,8 @@ def test_part_of_a_garment_is_known_as_another(nets):
     asked = Garment.bare("top", Mesh(whole.mesh.vertices.clone().requires_grad_(), whole.mesh.faces))
     with torch.no_grad():
         draper.known(asked)
-    edges = draper.known(asked).edges  # what was remembered without a gradient is not given out for one
-    assert edges is not None and edges.lengths.requires_grad
+    ending = draper.known(asked).ending  # what was remembered without a gradient is not given out for one
+    assert ending is not None and ending.edges.lengths.requires_grad
 
 
 def test_weights_sum_to_one_and_field_is_of_points_alone(nets):
