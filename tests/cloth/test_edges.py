@@ -7,7 +7,7 @@ import torch
 from sheets import sheet
 from torch import Tensor
 
-from recon.cloth.edges import FACTOR, LONGEST, LOOK, OFFSET, EdgeProjection, momentum
+from recon.cloth.edges import FACTOR, FAST, LONGEST, LOOK, OFFSET, EdgeProjection, momentum
 from recon.cloth.energies import Cloth
 from recon.types import Mesh
 
@@ -20,7 +20,7 @@ ROUNDS = LOOK + 3
 def twin(x: Tensor, lengths: Tensor, rounds: int, held: Tensor, planes: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """The rounds as plain sums over edges."""
     one, other = CLOTH.edges.unbind(1)
-    share = 0.5 * FACTOR / torch.bincount(CLOTH.edges.flatten(), minlength=x.shape[1]).to(x)
+    share = 0.5 * (FAST if rounds > 2 else FACTOR) / torch.bincount(CLOTH.edges.flatten(), minlength=x.shape[1]).to(x)
     share[held] = 0
     free = (share > 0).to(x)[:, None]
     before = x
