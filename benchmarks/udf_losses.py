@@ -127,7 +127,7 @@ def main() -> None:
     """Train what is not there yet; write JSON, picture and page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--family", default="lower", choices=sorted(FAMILIES))
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--garments", type=int, default=6, help="of each kind")
     parser.add_argument("--measured", type=int, default=4)
     parser.add_argument("--threads", type=int, default=1)

@@ -22,6 +22,7 @@ from recon.bodies.clearance import Clearance, Clearing
 from recon.cloth.frames import FrameWeights
 from recon.draping.binding import JOINTS, METHODS, BodyField
 from recon.draping.drapenet import GROUPS, Displacements, DrapeNets, DrapeShape, Prepared, under_top, widened
+from recon.draping.ending import Ending
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest, read_weights, write_weights
 from recon.garments import load_decoder
@@ -74,6 +75,8 @@ class TrainDrapenet:
     """Standard deviation of the shape coefficients of training bodies, cut at two; the population's is 1."""
     rate: float = 1.5e-3
     """Adam's learning rate at the start; decays along a cosine."""
+    rounds: int = 12
+    """Rounds that end a drape: half of the product's, for edges about twice as long."""
     collision: float = 2e4
     """Stiffness of contact with the body [J/m³ per vertex]."""
     usual: float = 0.2
@@ -199,6 +202,7 @@ class DrapeLoss:
         with torch.no_grad():
             skinning = SkinningDraper(body)
             self.ready = [nets.prepare(g.mesh, self.group, nets.bound(g.mesh, skinning)) for g in garments]
+            self.endings = [Ending.of(g, skinning.surface, config.rounds) for g in garments]
             self.held = [trunk(g, body) if self.group == "bottom" else None for g in garments]
             self.overlap = torch.zeros(len(garments), 0)
             self.covered: dict[tuple[int, int], Covered] = {}
@@ -223,7 +227,7 @@ class DrapeLoss:
                 over = int(torch.multinomial(self.overlap[k], 1, generator=generator))
                 above = self.tops[over][1]
             moved = self._moved(ready, above, body)
-            x = ready.place(moved, body)
+            x = self.endings[k](ready.place(moved, body), body)
             energy, terms = self.wardrobe.physics[k](x)
             if self.held[k] is not None:
                 energy = energy + c.pin * pinned(moved[:, self.held[k]], c.pin_side)
