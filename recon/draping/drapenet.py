@@ -24,6 +24,7 @@ from recon.bodies.skin import shaped, skin
 from recon.draping.body_field import JOINTS, BodyFieldNet
 from recon.draping.ending import Ending
 from recon.draping.isp import pose_features
+from recon.draping.layering import Beneath, settled
 from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
 from recon.draping.nodes import Nodes
 from recon.draping.rest_code import RestCode
@@ -306,10 +307,14 @@ class DrapeNetDraper:
         return self._draped(garment, body, self.known(garment))
 
     def outfit(self, top: Garment, bottom: Garment, body: PosedBody) -> tuple[Mesh, Mesh]:
-        """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9)."""
+        """Top and bottom together, the bottom drawn under the top by the intersection solver (Eq. 9).
+
+        What the solver leaves is a few vertices: with its last rounds the top is brought above the bottom, too.
+        """
         over, beneath = self.known(top), self.known(bottom)
         lower = self._draped(bottom, body, replace(beneath, above=over.code))
-        return self._draped(top, body, over), lower
+        below = [Beneath.all_of(layer) for layer in (body.mesh, lower)]
+        return settled(top, self._draped(top, body, over), below), lower
 
     def _draped(self, garment: Garment, body: PosedBody, known: Known) -> Mesh:
         return Mesh(self.nets.draped(garment.mesh, self.group(garment), body, known), garment.mesh.faces)
