@@ -36,10 +36,11 @@ from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import Crossings
-from recon.cloth.untangle import untangle
+from recon.draping.apart import draw_apart
 from recon.draping.isp import IspDraper, load_isp_draper
 from recon.draping.layering import Beneath, Layering, Raster, load_layering
 from recon.draping.projected import ProjectedDraper
+from recon.draping.skinning import SkinningDraper
 from recon.files.motions import read_clip
 from recon.files.weights import read_manifest
 from recon.garments import load_decoder
@@ -182,7 +183,8 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
         seed = _seed(kind, group)
         garments = unseen_garments(kind, 1, size.resolution, seed) + unseen_garments("top", TOPS, size.resolution, seed)
         with torch.no_grad():
-            posed = body.pose(unseen_bodies(size.bodies, body, seed))
+            bodies = unseen_bodies(size.bodies, body, seed)
+            posed = body.pose(bodies)
             drapes = [draper.drape(g, posed) for g in garments]
             outcomes = {
                 "without": drapes,
@@ -193,7 +195,8 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
             ways[way].append(table(layers, posed, body))
         for count, found in clean.items():
             if len(found) < size.tangled // {"2": 1, "5": 4}[count]:
-                found.append(drawn_apart(outcomes["with"][: int(count)], posed, body))
+                place = BodyPose(*(t[:1] for t in vars(bodies).values()))
+                found.append(drawn_apart(garments[: int(count)], outcomes["with"], body, place, draper.skinning))
         say(f"{kind}: outfit {group + 1} of {size.groups}")
     tables = {way: np.concatenate(found, 1) for way, found in ways.items()}
     figures: dict = {
@@ -215,11 +218,25 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
     return figures
 
 
-def drawn_apart(layers: Sequence[Mesh], posed: PosedBody, body: Body) -> dict:
-    """The first body's layers after untangling, checked exactly."""
-    here = [m.with_vertices(m.vertices[0]) for m in layers]
-    done = untangle(here[::-1], Mesh(posed.mesh.vertices[0], body.faces))
-    return {"before": done.crossings, "after": len(done.left), "inside": done.inside, "clean": done.clean}
+def drawn_apart(
+    garments: Sequence[Garment], layers: Sequence[Mesh], body: Body, pose: BodyPose, skinning: SkinningDraper
+) -> dict:
+    """The first body's innermost layers after untangling, checked exactly; what the body does to itself in the pose."""
+    here = [m.with_vertices(m.vertices[0]) for m in layers[: len(garments)]]
+    began = time.perf_counter()
+    apart = draw_apart(garments, here, body, pose, skinning)
+    skin = body.pose(pose).mesh.vertices[0].double().numpy()
+    test = Crossings(body.faces.numpy(), len(skin))
+    return {
+        "before": apart.before,
+        "after": len(apart.done.left),
+        "inside": apart.done.inside,
+        "clean": apart.done.clean,
+        "dressed": apart.dressed,
+        "strain": round(apart.done.strain, 4),
+        "body_through_itself": len(test.pairs(test(skin))),
+        "seconds": round(time.perf_counter() - began, 1),
+    }
 
 
 def drape_ms(

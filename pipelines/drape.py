@@ -23,8 +23,8 @@ from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import self_intersections
 from recon.cloth.projective import Projecting
-from recon.cloth.untangle import Untangled, untangle
 from recon.draping import DRAPERS, Draper, load_draper
+from recon.draping.apart import Apart, draw_apart
 from recon.draping.isp import IspDraper
 from recon.draping.layering import Beneath, Layering, load_layering
 from recon.draping.openings import Openings
@@ -121,10 +121,8 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
     if config.untangle:
         at = time.perf_counter()
         say("untangle ...")  # seconds for a pair, a minute for a stack
-        done = untangle(layers[::-1], Mesh(posed.mesh.vertices[0], body.faces))
-        moved = [torch.as_tensor(x).float() for x in done.vertices[::-1]]
-        layers = [mesh.with_vertices(x) for mesh, x in zip(layers, moved, strict=True)]
-        figures["untangle"] = _story(done)
+        apart = draw_apart(things, layers, body, worn_by, SkinningDraper(body), say)
+        layers, figures["untangle"] = apart.layers, _story(apart)
         timed("untangle", at)
     figures["garments"] = measure(names, things, layers, posed, body)
     for name, drawn in zip(names, how, strict=True):
@@ -273,9 +271,11 @@ def measure(
     return figures
 
 
-def _story(done: Untangled) -> dict:
+def _story(apart: Apart) -> dict:
+    done = apart.done
     return {
-        "crossing_pairs_before": done.crossings,
+        "crossing_pairs_before": apart.before,
+        "dressed_by_simulation": apart.dressed,
         "crossing_pairs_after": len(done.left),
         "inside_body_after": done.inside,
         "rounds": done.rounds,
