@@ -189,5 +189,5 @@ def store(net: DisplacementNet, config: TrainDrapeIsp, done: Training) -> Path:
     }
     if config.start is not None:
         earlier = read_manifest(config.start).get(f"drape-isp-{config.kind}", {})
-        card["before"] = {key: earlier.get(key) for key in ("steps", "minutes", "settings")}
+        card["before"] = {key: earlier.get(key) for key in ("steps", "minutes", "settings", "before") if key in earlier}
     return write_weights(f"drape-isp-{config.kind}", dict(net.state_dict()), card, config.out)
