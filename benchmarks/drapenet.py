@@ -43,7 +43,7 @@ from recon.cloth.energies import Cloth, bending, gravity, stvk
 from recon.draping.drapenet import DrapeNetDraper, DrapeNets, Known, load_drapenet
 from recon.draping.dress import dress
 from recon.draping.ending import Ending
-from recon.draping.layering import Beneath
+from recon.draping.layering import Beneath, settled
 from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest
@@ -122,7 +122,10 @@ def outside_pct(bottom: Mesh, top: Mesh) -> float:
 
 
 def pairs(size: Size, draper: DrapeNetDraper, skinning: SkinningDraper, body: Body, clear: bool) -> list[dict]:
-    """Tops over bottoms: G2G [%] and the bottom's B2G [%] with the solver, without it, and by skinning."""
+    """Tops over bottoms: G2G [%] and the bottom's B2G [%].
+
+    With the solver and the top's last rounds above the bottom, with either, with neither, and by skinning.
+    """
     tops = sorted(load_garments("top", "test"), key=lambda g: float(g.mesh.vertices[:, 1].min()))
     bottoms = [g for kind in GROUPS["bottom"] for g in load_garments(kind, "test")]
     bottoms.sort(key=lambda g: -float(g.mesh.vertices[:, 1].max()))
@@ -132,9 +135,13 @@ def pairs(size: Size, draper: DrapeNetDraper, skinning: SkinningDraper, body: Bo
         posed = body.pose(unseen_bodies(1, body, 50 + k, clear))
         contact = BodyContact(posed.mesh.vertices[0], body.faces)
         over, under = draper.outfit(top, bottom, posed)
+        free, plain = draper.drape(top, posed), draper.drape(bottom, posed)
+        below = [Beneath.all_of(layer) for layer in (posed.mesh, plain)]
         for way, (upper, lower) in {
             "solver": (over, under),
-            "alone": (over, draper.drape(bottom, posed)),
+            "solver, top alone": (free, under),
+            "alone, top above it": (settled(top, free, below), plain),
+            "alone": (free, plain),
             "skinning": (skinning.drape(top, posed), skinning.drape(bottom, posed)),
         }.items():
             lower, upper = (m.with_vertices(m.vertices[0]) for m in (lower, upper))

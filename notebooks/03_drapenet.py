@@ -60,7 +60,7 @@ with torch.no_grad():
         print(f"{name}: {inside[0]:.2f} % of the top and {inside[1]:.2f} % of the trousers inside the body")
 
 # %% [markdown]
-# Top over bottom: the intersection solver draws the trousers under the top (Eq. 9).
+# Top over bottom: the intersection solver draws the trousers under the top (Eq. 9), and the top ends above them.
 
 # %%
 size = (240, 160) if QUICK else (640, 420)
