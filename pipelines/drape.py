@@ -123,6 +123,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
         say("untangle ...")  # seconds for a pair, a minute for a stack
         apart = draw_apart(things, layers, body, worn_by, SkinningDraper(body), say)
         layers, figures["untangle"] = apart.layers, _story(apart)
+        how = [f"simulation, after {by}" for by in how] if apart.dressed else how
         timed("untangle", at)
     figures["garments"] = measure(names, things, layers, posed, body)
     for name, drawn in zip(names, how, strict=True):
