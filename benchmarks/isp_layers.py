@@ -38,7 +38,7 @@ from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import Crossings
 from recon.draping.apart import draw_apart
 from recon.draping.isp import IspDraper, load_isp_draper
-from recon.draping.layering import Beneath, Layering, Raster, load_layering
+from recon.draping.layering import Beneath, Layering, Raster, load_layering, settled
 from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.motions import read_clip
@@ -242,12 +242,12 @@ def drawn_apart(
 def drape_ms(
     body: Body, draper: IspDraper, layering: Layering, resolution: int = 128, rounds: int = 7
 ) -> dict[str, float]:
-    """Median milliseconds a garment of each kind: one pose of a prepared garment, preparing it, D_m over the body."""
+    """Median milliseconds a garment of each kind: a pose of a prepared garment, preparing it, layering's two parts."""
     posed = body.pose(unseen_bodies(1, body, 1))
     figures = {}
     for kind in draper.nets:
         (garment,) = unseen_garments(kind, 1, resolution, 3)
-        times: dict[str, list[float]] = {"": [], "_prepare": [], "_layer": [], "_steps": []}
+        times: dict[str, list[float]] = {"": [], "_prepare": [], "_layer": [], "_settle": [], "_steps": []}
         stepping = ProjectedDraper(draper, draper.skinning)
         stepping.drape(garment, posed)
         raster, mesh, skin = Raster.of(garment), draper.drape(garment, posed), Beneath.all_of(posed.mesh)
@@ -258,6 +258,7 @@ def drape_ms(
                 "": lambda g=garment: draper.drape(g, posed),
                 "_steps": lambda g=garment, s=stepping: s.drape(g, posed),
                 "_layer": lambda r=raster, m=mesh, s=skin: layering.over(r, m, s),
+                "_settle": lambda g=garment, m=mesh, s=skin: settled(g, m, [s]),
             }
             for part, run in runs.items():
                 with torch.no_grad():
@@ -355,7 +356,8 @@ def page(figures: dict) -> str:
     lines += [f"{figures['machine']}; poses: {figures['pose_source']}. `python benchmarks/isp_layers.py` makes it.", ""]
     busy = " (more than its cores: times are too long)" if figures["load"] > (os.cpu_count() or 1) else ""
     lines += [f"Load of the machine when it was measured: {figures['load']}{busy}.", ""]
-    lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m once;"]
+    lines += ["Milliseconds a garment at resolution 128 (`_prepare`: once a garment; `_layer`: D_m over the body;"]
+    lines += ["`_settle`: the rounds that end layering, the body alone below;"]
     lines += ["`_steps`: D_s with projective steps after it):", ""]
     lines += [", ".join(f"{name} {value}" for name, value in figures["drape_ms"].items()), ""]
     says = {"skinning": "skinning", "displaced": "D_s", "layered": "D_s, D_m over the body", "projected": "D_s, steps"}
