@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from recon.cloth.edges import Planes
+from recon.cloth.edges import OFFSET, planes
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
@@ -36,8 +36,9 @@ class Surface:
         rest = vertices.detach().cpu().double().numpy()
         self._tree = cKDTree(rest)
         rings = rings_of(faces.cpu().numpy(), len(rest))
-        self._rings = wp.array(rings, dtype=wp.vec2i, device=self.device)
-        self._marks = wp.array(spread(rest, LANDMARKS).astype(np.int32), dtype=int, device=self.device)
+        self.count, self.width = rings.shape[:2]
+        self._rings = wp.array(rings.reshape(-1, 2), dtype=wp.vec2i, device=self.device)
+        self._marks = torch.as_tensor(spread(rest, LANDMARKS), device=vertices.device)
 
     def nearest_at_rest(self, x: Tensor) -> Tensor:
         """(V,) int32: where walks of a garment's vertices (V, 3) at rest start."""
@@ -50,18 +51,27 @@ class Surface:
         Raises:
             ValueError: bodies of another topology.
         """
-        if body.dim() != 3 or body.shape[1] != len(self._rings):
-            raise ValueError(f"body: found vertices {tuple(body.shape)}; wanted (B, {len(self._rings)}, 3)")
+        if body.dim() != 3 or body.shape[1] != self.count:
+            raise ValueError(f"body: found vertices {tuple(body.shape)}; wanted (B, {self.count}, 3)")
         return Beside(self, body, start)
 
-    def _walk(self, body: Tensor, x: Tensor, near: Tensor, normal: Tensor, first: bool) -> None:
-        views: list[Any] = [wp.from_torch(t, dtype=wp.vec3) for t in (body, x, normal)]
-        given = [self._rings, self._marks, *views, wp.from_torch(near), int(first)]
+    def _walk(self, body: Tensor, x: Tensor, near: Tensor, found: Tensor, first: bool) -> None:
+        others = self._nearest_marks(body, x) if first else near.new_zeros(0, 0)
+        points = [wp.from_torch(t.view(-1, 3), dtype=wp.vec3) for t in (body, x)]
+        numbers = [wp.from_torch(t.view(-1)) for t in (near, others)]
+        above = wp.from_torch(found.view(-1, 4), dtype=wp.vec4)
+        given: list[Any] = [self._rings, self.width, *points, above, *numbers, near.shape[1]]
         wp.launch(_walk, near.numel(), inputs=given, device=self.device)
+
+    def _nearest_marks(self, body: Tensor, x: Tensor) -> Tensor:
+        """(B, V) int32, the nearest landmark of each point (B, V, 3); by products, whose roundings are millimetres."""
+        marks = body[:, self._marks]
+        apart = torch.baddbmm(marks.square().sum(-1)[:, None], x, marks.transpose(1, 2), alpha=-2)
+        return self._marks[apart.argmin(-1)].int()
 
 
 class Beside:
-    """Says planes (``recon.cloth.edges.Planes``) whenever it is asked; walks go on from where the last ones ended."""
+    """Says planes (``recon.cloth.edges.planes``) whenever it is asked; walks go on from where the last ones ended."""
 
     def __init__(self, surface: Surface, body: Tensor, start: Tensor):
         self.surface, self.body = surface, body
@@ -69,20 +79,21 @@ class Beside:
         self.seen = body.detach().float().contiguous()
         self.first = True
 
-    def __call__(self, x: Tensor) -> Planes:
-        """(B, V, 3) [m] -> points, differentiable in the body's vertices, and normals, which are not.
+    def __call__(self, x: Tensor) -> Tensor:
+        """(B, V, 3) [m] -> planes (B, V, 4), their heights differentiable in the body's vertices.
 
         Raises:
             ValueError: not as many garments as bodies.
         """
         if x.shape[:2] != self.near.shape:
             raise ValueError(f"garment: found vertices {tuple(x.shape)}; wanted {(*self.near.shape, 3)}")
-        x = x.contiguous()
-        normal = torch.empty_like(x)
-        self.surface._walk(self.seen, x, self.near, normal, self.first)
+        found = x.new_empty(*x.shape[:2], 4)
+        self.surface._walk(self.seen, x.contiguous(), self.near, found, self.first)
         self.first = False
+        if not (torch.is_grad_enabled() and self.body.requires_grad):
+            return found
         which = self.near.long()[..., None].expand(-1, -1, 3)
-        return self.body.float().gather(1, which), normal
+        return planes(self.body.float().gather(1, which), found[..., :3])
 
 
 def rings_of(faces: NDArray, count: int) -> NDArray:
@@ -107,17 +118,20 @@ def spread(points: NDArray, count: int) -> NDArray:
 
 
 @wp.func
-def _descend(rings: wp.array2d(dtype=wp.vec2i), body: wp.array2d(dtype=wp.vec3), b: int, start: int, p: wp.vec3) -> int:
+def _descend(
+    rings: wp.array(dtype=wp.vec2i), width: int, body: wp.array(dtype=wp.vec3), base: int, start: int, p: wp.vec3
+) -> int:
+    # To the neighbour that is nearest to p, as long as one is nearer.
     here = int(start)
-    best = float(wp.length_sq(body[b, start] - p))
-    last = int(-1)  # noqa: UP018 - the same
+    best = float(wp.length_sq(body[base + start] - p))
+    last = int(-1)  # noqa: UP018 - Warp's way to say that it changes
     while here != last:
         last = int(here)
-        for k in range(rings.shape[1]):
-            j = rings[last, k][0]
+        for k in range(last * width, (last + 1) * width):
+            j = rings[k][0]
             if j < 0:
                 break
-            far = wp.length_sq(body[b, j] - p)
+            far = wp.length_sq(body[base + j] - p)
             if far < best:
                 best = far
                 here = j
@@ -126,36 +140,34 @@ def _descend(rings: wp.array2d(dtype=wp.vec2i), body: wp.array2d(dtype=wp.vec3),
 
 @wp.kernel
 def _walk(
-    rings: wp.array2d(dtype=wp.vec2i),
-    marks: wp.array(dtype=int),
-    body: wp.array2d(dtype=wp.vec3),
-    x: wp.array2d(dtype=wp.vec3),
-    normal: wp.array2d(dtype=wp.vec3),
-    near: wp.array2d(dtype=int),
-    first: int,
+    rings: wp.array(dtype=wp.vec2i),
+    width: int,
+    body: wp.array(dtype=wp.vec3),
+    x: wp.array(dtype=wp.vec3),
+    above: wp.array(dtype=wp.vec4),
+    near: wp.array(dtype=int),
+    others: wp.array(dtype=int),
+    count: int,
 ):
     t = wp.tid()
-    b = t // near.shape[1]
-    i = t - b * near.shape[1]
-    p = x[b, i]
-    at = _descend(rings, body, b, near[b, i], p)
-    if first > 0:
-        mark = int(0)  # noqa: UP018 - Warp's way to say that it changes
-        best = float(1.0e9)  # noqa: UP018 - the same
-        for k in range(marks.shape[0]):
-            far = wp.length_sq(body[b, marks[k]] - p)
-            if far < best:
-                best = far
-                mark = marks[k]
-        other = _descend(rings, body, b, mark, p)
-        far = wp.length_sq(body[b, other] - p)
-        if far < wp.length_sq(body[b, at] - p) and far < STRANGE * STRANGE:
+    base = t / count * (rings.shape[0] / width)
+    p = x[t]
+    at = _descend(rings, width, body, base, near[t], p)
+    if others.shape[0] > 0:
+        other = _descend(rings, width, body, base, others[t], p)
+        far = wp.length_sq(body[base + other] - p)
+        if far < wp.length_sq(body[base + at] - p) and far < STRANGE * STRANGE:
             at = other
-    near[b, i] = at
+    near[t] = at
     out = wp.vec3(0.0, 0.0, 0.0)
-    for k in range(rings.shape[1]):
-        c = rings[at, k]
+    on = body[base + at]
+    for k in range(at * width, (at + 1) * width):
+        c = rings[k]
         if c[0] < 0:
             break
-        out += wp.cross(body[b, c[0]] - body[b, at], body[b, c[1]] - body[b, at])
-    normal[b, i] = wp.normalize(out)
+        out += wp.cross(body[base + c[0]] - on, body[base + c[1]] - on)
+    normal = wp.normalize(out)
+    height = float(-1.0)  # noqa: UP018 - the same
+    if wp.length_sq(normal) > 0.0:
+        height = wp.dot(normal, on) + OFFSET
+    above[t] = wp.vec4(normal[0], normal[1], normal[2], height)

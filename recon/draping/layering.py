@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from recon.cloth.constraints import open_rim
 from recon.cloth.contact import BodyContact
-from recon.cloth.edges import OFFSET, Planes
+from recon.cloth.edges import planes
 from recon.draping.ending import edges_of
 from recon.draping.uv import FLAT_SCALE, Welding
 from recon.files.weights import read_weights
@@ -335,16 +335,16 @@ class Layering:
 def settled(garment: Garment | Mesh, outer: Mesh, below: Sequence[Sequence[Beneath]]) -> Mesh:
     """A garment (B, V, 3) that was moved off the layers below, edges drawn to their lengths again above them all."""
 
-    def planes(x: Tensor) -> Planes:
+    def beside(x: Tensor) -> Tensor:
         normals = vertex_normals(x, outer.faces)
         found = [_deepest([layer[b] for layer in below], x[b], normals[b]) for b in range(len(x))]
         points, out = (torch.stack(part) for part in zip(*found, strict=True))
-        return points + (MARGIN - OFFSET) * out, out
+        return planes(points, out, MARGIN)
 
-    return outer.with_vertices(edges_of(garment, SETTLING)(outer.vertices, planes, LOOK))
+    return outer.with_vertices(edges_of(garment, SETTLING)(outer.vertices, beside, LOOK))
 
 
-def _deepest(layers: Sequence[Beneath], x: Tensor, normals: Tensor) -> Planes:
+def _deepest(layers: Sequence[Beneath], x: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Of the layers' surfaces beside points (V, 3) the one that each is deepest beneath: point, normal or none."""
     found = [layer.closest(x, normals) for layer in layers]
     on, out = (torch.stack([f[k] for f in found]) for k in (0, 1))

@@ -7,7 +7,7 @@ import torch
 from sheets import sheet
 from torch import Tensor
 
-from recon.cloth.edges import FACTOR, FAST, LONGEST, LOOK, OFFSET, EdgeProjection, momentum
+from recon.cloth.edges import FACTOR, FAST, LONGEST, LOOK, OFFSET, EdgeProjection, momentum, planes
 from recon.cloth.energies import Cloth
 from recon.types import Mesh
 
@@ -17,7 +17,7 @@ HELD = torch.tensor([0, 4])
 ROUNDS = LOOK + 3
 
 
-def twin(x: Tensor, lengths: Tensor, rounds: int, held: Tensor, planes: tuple[Tensor, Tensor] | None = None) -> Tensor:
+def twin(x: Tensor, lengths: Tensor, rounds: int, held: Tensor, on: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """The rounds as plain sums over edges."""
     one, other = CLOTH.edges.unbind(1)
     share = 0.5 * (FAST if rounds > 2 else FACTOR) / torch.bincount(CLOTH.edges.flatten(), minlength=x.shape[1]).to(x)
@@ -30,8 +30,8 @@ def twin(x: Tensor, lengths: Tensor, rounds: int, held: Tensor, planes: tuple[Te
         ask = away * (q - square) / (q + square)
         moved = torch.zeros_like(x).index_add(1, one, ask).index_add(1, other, -ask)
         after = before + gain * (x - share[:, None] * moved - before)
-        if planes is not None:
-            point, normal = planes
+        if on is not None:
+            point, normal = on
             lack = OFFSET - ((after - point) * normal).sum(-1, keepdim=True)
             after = after + normal * lack.clamp(0, LONGEST)
         before, x = x, torch.where(free > 0, after, x)
@@ -73,7 +73,7 @@ def test_values_and_gradients_are_the_twins(held: Tensor, rounds: int) -> None:
 def test_planes_hold_vertices_up_and_take_their_gradients() -> None:
     x, way, lengths = crumpled(0.005).requires_grad_(), crumpled(1.0), CLOTH.edge_lengths
     point, normal = floor(x.detach())
-    y = EdgeProjection(CLOTH.edges, lengths, x.shape[1], ROUNDS, HELD)(x, lambda _: (point, normal))
+    y = EdgeProjection(CLOTH.edges, lengths, x.shape[1], ROUNDS, HELD)(x, lambda _: planes(point, normal))
     found = torch.autograd.grad((y * way).sum(), [x, point])
     precise = [t.detach().double().requires_grad_() for t in (x, point)]
     wanted = twin(precise[0], lengths.double(), ROUNDS, HELD, (precise[1], normal.double()))
