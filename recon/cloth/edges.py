@@ -17,6 +17,7 @@ import warp as wp
 from torch import Tensor
 
 from recon.cloth.energies import Cloth
+from recon.cloth.threads import launch
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
@@ -103,7 +104,7 @@ class EdgeProjection:
     def run(self, kernel: Any, drapes: int, arrays: list[wp.array], *numbers: float) -> None:
         """A kernel with one thread for each vertex of so many drapes."""
         given = [*self.known, *arrays, drapes * self.count, *numbers]
-        wp.launch(kernel, drapes * self.count, inputs=given, device=self.device)
+        launch(kernel, drapes * self.count, given, self.device)
 
 
 def momentum(rounds: int) -> list[float]:
@@ -205,9 +206,10 @@ def _draw(
     now: int,
     after: int,
     gain: float,
+    start: int,
 ):
     # The last states lie in the slots before and now, the next one comes into after.
-    t = wp.tid()
+    t = start + wp.tid()
     i = _vertex(t, shares.shape[0])
     share = shares[i]
     x = at[now * all + t]
@@ -235,9 +237,10 @@ def _leave_back(
     all: int,
     k: int,
     gain: float,
+    start: int,
 ):
     # What was brought to its plane is moved out or in by the plane alone.
-    t = wp.tid()
+    t = start + wp.tid()
     i = _vertex(t, shares.shape[0])
     share = shares[i]
     if share > 0.0:
@@ -263,9 +266,10 @@ def _draw_back(
     all: int,
     k: int,
     gain: float,
+    start: int,
 ):
     # What an edge asks for changes with its ends by the symmetric matrix r I + 4 L² / (q + L²)² a a^T.
-    t = wp.tid()
+    t = start + wp.tid()
     i = _vertex(t, shares.shape[0])
     now = (k + 1) * all + t
     x, own, share = at[now], grad[now + all], shares[i]

@@ -7,6 +7,7 @@ import torch
 from sheets import sheet
 from torch import Tensor
 
+from recon.cloth import threads
 from recon.cloth.edges import FACTOR, FAST, LONGEST, LOOK, OFFSET, EdgeProjection, momentum, planes
 from recon.cloth.energies import Cloth
 from recon.types import Mesh
@@ -100,6 +101,21 @@ def test_momentum_reaches_further_than_as_many_plain_rounds() -> None:
     layer, plain = EdgeProjection.of(CLOTH, 24), EdgeProjection.of(CLOTH, 24)
     plain.momentum = [1.0] * 24
     assert strain(layer(stretched)) < 0.5 * strain(plain(stretched))
+
+
+def test_threads_change_nothing(monkeypatch) -> None:
+    x, way = crumpled(0.005), crumpled(1.0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    found = []
+    for worth in (10**9, 10):
+        monkeypatch.setattr(threads, "WORTH", worth)
+        lengths, at = CLOTH.edge_lengths.clone().requires_grad_(), x.clone().requires_grad_()
+        point, normal = floor(x)
+        layer = EdgeProjection(CLOTH.edges, lengths, x.shape[1], ROUNDS, HELD)
+        y = layer(at, lambda _, p=point, n=normal: planes(p, n))
+        found.append([y, *torch.autograd.grad((y * way).sum(), [at, lengths, point])])
+    for one, several in zip(*found, strict=True):
+        assert torch.equal(one, several)
 
 
 def test_doubles_come_back_as_doubles() -> None:
