@@ -2,7 +2,7 @@
 
 Nearest vertices of the body are found by walking over its surface, from the one that was nearest at rest (so that cloth
 stays with the part that it rides on) and from the nearest of a few landmarks (so that other parts that came near are
-found, too): twenty times as fast as a search tree, which would have to be built for each pose.
+found, too): the first time in a third of what a search tree takes, later in a tenth.
 """
 
 from __future__ import annotations
