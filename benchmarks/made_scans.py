@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from recon.bodies import Body
+from recon.bodies.clearance import clear_bodies
 from recon.bodies.pose_prior import mean_pose, sample_poses
 from recon.bodies.poses import a_pose, t_pose
 from recon.draping import Draper
@@ -63,14 +64,17 @@ class MadeScan:
 
 
 def random_body(body: Body, pose: str, generator: torch.Generator) -> BodyPose:
-    """A random shape in the named pose (some degrees off it), turned anywhere about the vertical, somewhere."""
+    """A random shape in the named pose (some degrees off it), turned anywhere about the vertical, somewhere.
+
+    Random angles push limbs through the trunk, where no scanner finds them: they are turned out of it.
+    """
     shape = 0.7 * torch.randn(1, body.n_shape, generator=generator)
     away = 0.15 if pose != "random" else 0.8
     base = {"a": a_pose(1, 45.0), "t": t_pose(1), "standing": a_pose(1, 68.0), "random": mean_pose(1)}[pose]
     joints = base + away * (sample_poses(1, generator) - mean_pose(1))
     turn, place = (torch.rand(1, generator=generator) - 0.5).item(), torch.randn(3, generator=generator)
     joints[0, 0] = torch.tensor([0.0, 2 * math.pi * turn, 0.0])
-    return BodyPose(shape, joints, (place * torch.tensor([0.3, 0.05, 0.3]))[None])
+    return clear_bodies(BodyPose(shape, joints, (place * torch.tensor([0.3, 0.05, 0.3]))[None]), body)
 
 
 def test_garment(name: str, number: int) -> Garment:

@@ -122,7 +122,7 @@ def drape(config: Drape, say: Callable[[str], None] = print) -> Draped:
         at = time.perf_counter()
         say("untangle ...")  # seconds for a pair, a minute for a stack
         apart = draw_apart(things, layers, body, worn_by, SkinningDraper(body), say)
-        layers, figures["untangle"] = apart.layers, _story(apart)
+        layers, posed, figures["untangle"] = apart.layers, apart.posed, _story(apart)
         how = [f"simulation, after {by}" for by in how] if apart.dressed else how
         timed("untangle", at)
     figures["garments"] = measure(names, things, layers, posed, body)

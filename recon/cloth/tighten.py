@@ -67,7 +67,7 @@ class Tighten:
             step = keep_lengths(aim, self.edges[mine], lengths[mine], s.stiffness, s.sweeps) - x
             size = np.linalg.norm(step, axis=1, keepdims=True)
             aim = x + step * np.minimum(1, s.longest / np.maximum(size, 1e-12))
-            after = self.filtered(x, self._apart(aim, free, number) - x)
+            after = self.filtered(x, self.apart(aim, free, number) - x)
             far, x = np.abs(after - x).max(), after
             if far < s.enough:
                 break
@@ -80,10 +80,10 @@ class Tighten:
                 break
             aim = x.copy()
             everywhere = np.ones(len(x), bool)
-            x = self.filtered(x, self._apart(aim, everywhere, number) - x, False)
+            x = self.filtered(x, self.apart(aim, everywhere, number) - x, False)
         return x
 
-    def _apart(self, aim: NDArray, free: NDArray, number: int) -> NDArray:
+    def apart(self, aim: NDArray, free: NDArray, number: int) -> NDArray:
         """``aim`` (V, 3), moved in place to where less of it crosses and none of it is in the body."""
         self._leave(aim)
         for _ in range(self.settings.apart):

@@ -34,6 +34,7 @@ from recon.cloth.escape import Escape
 from recon.cloth.intersections import Crossings
 from recon.cloth.patches import Pockets, film
 from recon.cloth.repairs import Repairs
+from recon.cloth.stack import Stack
 from recon.cloth.tighten import Tighten, Tightening
 from recon.cloth.xpbd import keep_lengths
 from recon.types import Mesh
@@ -142,17 +143,14 @@ def untangle(layers: Sequence[Mesh], body: Mesh | None = None, settings: Untangl
 class _Tangle:
     def __init__(self, layers: Sequence[Mesh], body: Mesh | None, settings: Untangling):
         self.settings = settings
-        self.starts = np.cumsum([0, *[len(m.vertices) for m in layers]])
-        self.x = np.concatenate([m.vertices.detach().cpu().double().numpy() for m in layers])
-        faces = [m.faces.cpu().numpy() + at for m, at in zip(layers, self.starts[:-1])]
-        self.first_face = np.cumsum([0, *[len(f) for f in faces]])
-        self.faces = np.concatenate(faces)
+        self.stack = Stack.of(layers)
+        self.x, self.faces = self.stack.x, self.stack.faces
         self.crossings = Crossings(self.faces, len(self.x))
         self.edges = self.crossings.edges
         self.lengths = np.linalg.norm(self.x[self.edges[:, 0]] - self.x[self.edges[:, 1]], axis=1)
         self.body = Escape(body, self.x, self.faces, self.edges) if body is not None else None
         worn_on = self.body.body if self.body else None
-        self.repairs = Repairs(self.crossings, self.starts, settings.gap, float(self.lengths.mean()), worn_on)
+        self.repairs = Repairs(self.crossings, self.stack.starts, settings.gap, float(self.lengths.mean()), worn_on)
         self.repairs.tucked = settings.tuck
         self.layer = self.repairs.layer
         self.pockets = Pockets(self.crossings, self.x, self.layer)
@@ -173,11 +171,10 @@ class _Tangle:
                 self.x = clean
             found, lack = self.crossings(self.x), self._lack(fresh=True)
         left, inside = self.crossings.pairs(found), int(lack.sum())
-        layers = [self.x[a:b] for a, b in zip(self.starts[:-1], self.starts[1:])]
         ends = self.x[self.edges]
         strain = np.abs(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) / lengths - 1)
         notes = self._notes(left, inside)
-        return Untangled(layers, before, float(strain.mean()), left, inside, rounds, notes)
+        return Untangled(self.stack.split(self.x), before, float(strain.mean()), left, inside, rounds, notes)
 
     def _rounds(self, found: NDArray, lack: NDArray) -> int:
         """How many it took; ends clean, or with the best before cloth was laid flat: films stretch, and in vain."""
@@ -209,7 +206,7 @@ class _Tangle:
     def _round(self, found: NDArray, number: int) -> None:
         """One round of small moves, for the crossings ``found`` (K, 2)."""
         s, moved = self.settings, np.zeros(len(self.x), bool)
-        if len(found) and len(self.starts) > 2 and number % 2 == 0:
+        if len(found) and len(self.stack.starts) > 2 and number % 2 == 0:
             moved |= self.repairs.own_side(self.x, found, min(s.reach * (1 + self.flat), FARTHEST))
             found = self.crossings(self.x, self.repairs.around(self.x, found, 0.06))
         if len(found):
@@ -243,7 +240,7 @@ class _Tangle:
 
     def _notes(self, left: NDArray, inside: int) -> tuple[str, ...]:
         lines = []
-        of = np.searchsorted(self.first_face, left, side="right") - 1
+        of = np.searchsorted(self.stack.first_face, left, side="right") - 1
         for pair in np.unique(np.sort(of, 1), axis=0) if len(left) else []:
             mine = left[(np.sort(of, 1) == pair).all(1)]
             at = self.x[self.faces[mine[:, 0]]].mean((0, 1))

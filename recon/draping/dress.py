@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from recon.bodies import Body
+from recon.bodies.creases import open_creases
 from recon.cloth.constraints import Constraints
 from recon.cloth.energies import Cloth
 from recon.cloth.xpbd import Carry, Settings, carry
@@ -39,6 +40,8 @@ class Dressing:
     """Distance kept from the body and from the layer beneath [m]."""
     friction: float = 0.05
     """Coulomb friction: little, so that cloth slips to where it is at ease, as it does while people dress."""
+    creases: bool = False
+    """Whether skin gives way in the creases of elbows and knees."""
 
 
 def limits_of(garment: Garment | Mesh) -> Constraints:
@@ -60,7 +63,16 @@ def held_vertices(garment: Garment | Mesh) -> NDArray:
     return np.zeros(0, np.int64)
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class Dressed:
+    """A body on its way into a pose, and what it wears."""
+
+    garments: list[NDArray]
+    """(T, V, 3) of each, outermost first, double precision [m]."""
+    bodies: NDArray
+    """(T, B, 3) [m]."""
+
+
 def dress(
     garments: Sequence[Garment],
     body: Body,
@@ -69,7 +81,20 @@ def dress(
     settings: Dressing | None = None,
     tick: Callable[[int, float], None] | None = None,
 ) -> list[NDArray]:
-    """Garments worn over each other by one body, at rest in its pose.
+    """Garments worn over each other by one body, at rest in its pose: (V, 3) of each, as :func:`dressed` ends."""
+    return [frames[-1] for frames in dressed(garments, body, pose, skinning, settings, tick).garments]
+
+
+@torch.no_grad()
+def dressed(
+    garments: Sequence[Garment],
+    body: Body,
+    pose: BodyPose,
+    skinning: Draper,
+    settings: Dressing | None = None,
+    tick: Callable[[int, float], None] | None = None,
+) -> Dressed:
+    """Garments worn over each other by one body, on the way from the T pose into its own.
 
     Args:
         garments: outermost first, on the CPU, with panels that fit the body's shape (``grade``).
@@ -78,17 +103,15 @@ def dress(
         skinning: where the cloth is taken without simulation.
         settings: see :class:`Dressing`.
         tick: hears (frame, 0) after each frame of each garment.
-
-    Returns:
-        (V, 3) vertices of each garment, double precision [m].
     """
     s = settings or Dressing()
     posed, device = body.pose(_way(pose, s.frames)), pose.pose.device
+    posed = open_creases(posed) if s.creases else posed
     frames, faces = posed.mesh.vertices.cpu().numpy(), body.faces.cpu().numpy()
     simulation = Settings(
         bend_compliance=s.bend_compliance, self_distance=s.self_distance, offset=s.offset, friction=s.friction
     )
-    ends: list[NDArray] = []
+    skin, worn = frames, list[NDArray]()
     for garment in reversed(garments):
         skinned = skinning.drape(to_device(garment, device), posed).vertices.double().cpu().numpy()
         own = []
@@ -96,11 +119,11 @@ def dress(
             own.append(x)
             if tick:
                 tick(k, 0.0)
-        ends.append(own[-1])
+        worn.append(np.stack(own))
         # What lies beneath is part of what the next garment collides with.
         faces = np.concatenate([faces, garment.mesh.faces.cpu().numpy() + frames.shape[1]])
-        frames = np.concatenate([frames, np.stack(own).astype(np.float32)], 1)
-    return ends[::-1]
+        frames = np.concatenate([frames, worn[-1].astype(np.float32)], 1)
+    return Dressed(worn[::-1], skin)
 
 
 def neutral(pose: BodyPose) -> BodyPose:

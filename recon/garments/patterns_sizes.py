@@ -116,7 +116,8 @@ def trousers(variant: str, rng: np.random.Generator, m: Measures) -> Parameters:
     p["thigh_y"] = p["crotch_y"] - 0.04
     p["thigh_outer_x"] = float(p["crotch_radius"] + (m.leg.girth_at(m.crotch_y - 0.06) + SKIN) / 2 + ease)
     if variant == "shorts":
-        p["hem_y"] = rng.uniform(m.knee_y - 0.03, p["crotch_y"] - 0.10)
+        high = p["crotch_y"] - 0.10  # wide ones of a low crotch have no shorter hem than the longest
+        p["hem_y"] = rng.uniform(min(m.knee_y - 0.03, high), high)
     else:
         long, cropped = (m.ankle_y + 0.012, m.ankle_y + 0.07), (m.ankle_y + 0.10, m.knee_y - 0.12)
         p["hem_y"] = _pick(rng, [(0.75, *long), (0.25, *cropped)])
