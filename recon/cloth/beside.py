@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.cloth.edges import OFFSET, planes
-from recon.cloth.threads import launch
+from recon.cloth.threads import Launch
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
@@ -62,7 +62,7 @@ class Surface:
         numbers = [wp.from_torch(t.view(-1)) for t in (near, others)]
         above = wp.from_torch(found.view(-1, 4), dtype=wp.vec4)
         given: list[Any] = [self._rings, self.width, *points, above, *numbers, near.shape[1]]
-        launch(_walk, near.numel(), given, self.device)
+        Launch(_walk, near.numel(), given, self.device)()
 
     def _nearest_marks(self, body: Tensor, x: Tensor) -> Tensor:
         """(B, V) int32, the nearest landmark of each point (B, V, 3); by products, whose roundings are millimetres."""
