@@ -57,4 +57,3 @@ class Launch:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), "kernels")
-
