@@ -166,10 +166,12 @@ class _Project(torch.autograd.Function):
         draw = edges.launch(_draw, len(now), [*on, _array(at, Tile), _array(at, wp.float32)])
         for k, gain in enumerate(momentum):
             draw(*((k + n) % slots for n in range(3)), gain)
+        last, end = (at[(len(momentum) + n) % slots] for n in range(2))
+        if not learning:
+            return last, end
         ctx.edges, ctx.momentum = edges, momentum
-        if learning:
-            ctx.save_for_backward(at, normals, heights.detach())
-        return at[len(momentum) % slots].clone(), at[(len(momentum) + 1) % slots].clone()
+        ctx.save_for_backward(at, normals, heights.detach())
+        return last.clone(), end.clone()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
