@@ -84,16 +84,19 @@ class EdgeProjection:
         """R: what a group's vertices ask for lies in as many rows as one of them has edges at most."""
         self.edge_of_half = order % max(len(edges), 1)
         """(2 E,) edges, sorted by the vertex from which they are seen."""
-        turn = torch.arange(len(own), device=own.device) - (degree.cumsum(0) - degree)[own]
-        self.place_of_half = (first[own // LANES] + turn) * LANES + own % LANES
+        vertex = torch.arange(len(degree), device=edges.device)
+        group, lane = vertex // LANES, vertex % LANES
+        spot = 3 * LANES * group + lane  # of a vertex' x among the numbers of a drape's tiles
+        shift = LANES * (first[group] - degree.cumsum(0) + degree) + lane
+        self.place_of_half = LANES * torch.arange(len(own), device=edges.device) + shift[own]
         """(2 E,) where each lies in the rows; what is left of them draws a vertex to itself, that is nowhere."""
-        vertex = torch.arange(len(degree), device=own.device).view(-1, LANES).repeat_interleave(rows, 0).flatten()
-        squares = torch.ones_like(vertex, dtype=torch.float32)
-        vertex[self.place_of_half] = other
+        places = spot.view(-1, LANES).repeat_interleave(rows, 0).flatten()
+        squares = torch.ones_like(places, dtype=torch.float32)
+        places[self.place_of_half] = spot[other]
         squares[self.place_of_half] = lengths.detach().square()[self.edge_of_half].float().clamp_min(1e-20)
         self.known = [
             self._array(first, int),
-            self._array((vertex // LANES * 3 * LANES + vertex % LANES).view(-1, LANES), Places),
+            self._array(places.view(-1, LANES), Places),
             self._array(squares.view(-1, LANES), Lanes),
             self._array(share.float().view(-1, LANES), Lanes),
         ]
@@ -114,10 +117,16 @@ class EdgeProjection:
         now = before = self._tiles(x.float().reshape(-1, self.count, 3))
         step = look if beside else max(len(self.momentum), 1)
         for k in range(0, len(self.momentum), step):
-            above = beside(self._points(now.detach())) if beside else now.new_zeros(len(now), self.count, 4)
-            normals, heights = self._tiles(above[..., :3].detach()), self._tiles(above[..., 3:])
-            before, now = _Project.apply(before, now, self.lengths, normals, heights, self, self.momentum[k : k + step])
+            on = self._planes(now.detach(), beside)
+            before, now = _Project.apply(before, now, self.lengths, *on, self, self.momentum[k : k + step])
         return self._points(now).reshape(x.shape).to(x.dtype)
+
+    def _planes(self, now: Tensor, beside: Callable[[Tensor], Tensor] | None) -> tuple[Tensor, Tensor]:
+        """Normals (B, G, 3, LANES) and heights (B, G, 1, LANES) of what ``beside`` says; zeros: no planes."""
+        if beside is None:
+            return torch.zeros_like(now), torch.zeros_like(now[:, :, :1])
+        above = beside(self._points(now))
+        return self._tiles(above[..., :3].detach()), self._tiles(above[..., 3:])
 
     def launch(self, kernel: Any, drapes: int, arrays: list[wp.array]) -> Launch:
         """A kernel on so many drapes, one of its points for each group of their vertices."""
