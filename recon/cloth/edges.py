@@ -13,11 +13,12 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 import warp as wp
 from torch import Tensor
 
 from recon.cloth.energies import Cloth
-from recon.cloth.threads import launch
+from recon.cloth.threads import Launch
 
 wp.config.log_level = wp.LOG_ERROR  # else it prints what it finds and compiles
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +34,14 @@ OFFSET = 0.003
 """Distance above the planes that vertices are brought to [m]."""
 LONGEST = 0.02
 """Most that a plane moves a vertex in one round [m]."""
+LANES = 8
+"""Vertices that a kernel computes side by side, as many as a CPU's registers hold floats: a third to a half of the time
+that one after the other takes."""
+
+Lanes = wp.types.vector(LANES, float)
+Places = wp.types.vector(LANES, int)
+Tile = wp.types.matrix((3, LANES), float)
+"""Points side by side: their x, their y, their z."""
 
 
 def planes(point: Tensor, normal: Tensor, offset: float = OFFSET) -> Tensor:
@@ -60,21 +69,36 @@ class EdgeProjection:
             held: (H,) vertices that stay, a waistband's.
         """
         self.count, self.lengths, self.momentum = vertices, lengths, momentum(rounds)
+        self.groups = -(-vertices // LANES)
         self.device = str(edges.device)
-        degree = torch.bincount(edges.flatten(), minlength=vertices)
+        degree = torch.bincount(edges.flatten(), minlength=LANES * self.groups)
         share = 0.5 * (FAST if rounds > 2 else FACTOR) / degree.clamp_min(1)
         if held is not None:
             share[held] = 0
         ends = torch.cat([edges, edges.flip(1)])
         order = ends[:, 0].argsort(stable=True)
+        own, other = ends[order].unbind(1)
+        rows = degree.view(-1, LANES).amax(1)
+        first = F.pad(rows.cumsum(0), (1, 0))
+        self.rows = int(first[-1])
+        """R: what a group's vertices ask for lies in as many rows as one of them has edges at most."""
         self.edge_of_half = order % max(len(edges), 1)
         """(2 E,) edges, sorted by the vertex from which they are seen."""
-        squares = lengths.detach().square()[self.edge_of_half].clamp_min(1e-20)
+        vertex = torch.arange(len(degree), device=edges.device)
+        group, lane = vertex // LANES, vertex % LANES
+        spot = 3 * LANES * group + lane  # of a vertex' x among the numbers of a drape's tiles
+        shift = LANES * (first[group] - degree.cumsum(0) + degree) + lane
+        self.place_of_half = LANES * torch.arange(len(own), device=edges.device) + shift[own]
+        """(2 E,) where each lies in the rows; what is left of them draws a vertex to itself, that is nowhere."""
+        places = spot.view(-1, LANES).repeat_interleave(rows, 0).flatten()
+        squares = torch.ones_like(places, dtype=torch.float32)
+        places[self.place_of_half] = spot[other]
+        squares[self.place_of_half] = lengths.detach().square()[self.edge_of_half].float().clamp_min(1e-20)
         self.known = [
-            self._array(torch.cat([degree.new_zeros(1), degree.cumsum(0)]), int),
-            self._array((ends[:, 1] - ends[:, 0])[order], int),
-            self._array(squares, float),
-            self._array(share, float),
+            self._array(first, int),
+            self._array(places.view(-1, LANES), Places),
+            self._array(squares.view(-1, LANES), Lanes),
+            self._array(share.float().view(-1, LANES), Lanes),
         ]
 
     @classmethod
@@ -90,21 +114,37 @@ class EdgeProjection:
             beside: says the :func:`planes` beside vertices (B, V, 3), as often as it is asked.
             look: rounds between two times.
         """
-        now = before = x.float().reshape(-1, self.count, 3)
+        now = before = self._tiles(x.float().reshape(-1, self.count, 3))
         step = look if beside else max(len(self.momentum), 1)
         for k in range(0, len(self.momentum), step):
-            above = beside(now.detach()) if beside else now.new_zeros(0, 0, 4)
-            before, now = _Project.apply(before, now, self.lengths, above, self, self.momentum[k : k + step])
-        return now.view(x.shape).to(x.dtype)
+            on = self._planes(now.detach(), beside)
+            before, now = _Project.apply(before, now, self.lengths, *on, self, self.momentum[k : k + step])
+        return self._points(now).reshape(x.shape).to(x.dtype)
 
-    def _array(self, values: Tensor, kind: type) -> wp.array:
-        numbers = values.float() if kind is float else values.int()
+    def _planes(self, now: Tensor, beside: Callable[[Tensor], Tensor] | None) -> tuple[Tensor, Tensor]:
+        """Normals (B, G, 3, LANES) and heights (B, G, 1, LANES) of what ``beside`` says; zeros: no planes."""
+        if beside is None:
+            return torch.zeros_like(now), torch.zeros_like(now[:, :, :1])
+        above = beside(self._points(now))
+        return self._tiles(above[..., :3].detach()), self._tiles(above[..., 3:])
+
+    def launch(self, kernel: Any, drapes: int, arrays: list[wp.array]) -> Launch:
+        """A kernel on so many drapes, one of its points for each group of their vertices."""
+        given = [*self.known, *arrays, drapes * self.groups]
+        return Launch(kernel, drapes * self.groups, given, self.device, LANES)
+
+    def _array(self, values: Tensor, kind: Any) -> wp.array:
+        numbers = values if values.is_floating_point() else values.int()
         return wp.array(numbers.cpu().numpy(), dtype=kind, device=self.device)
 
-    def run(self, kernel: Any, drapes: int, arrays: list[wp.array], *numbers: float) -> None:
-        """A kernel with one thread for each vertex of so many drapes."""
-        given = [*self.known, *arrays, drapes * self.count, *numbers]
-        launch(kernel, drapes * self.count, given, self.device)
+    def _tiles(self, values: Tensor) -> Tensor:
+        """(B, V, C) -> (B, G, C, LANES), group by group side by side."""
+        filled = F.pad(values, (0, 0, 0, LANES * self.groups - self.count))
+        return filled.unflatten(1, (self.groups, LANES)).transpose(2, 3).contiguous()
+
+    def _points(self, tiles: Tensor) -> Tensor:
+        """And back."""
+        return tiles.transpose(2, 3).flatten(1, 2)[:, : self.count]
 
 
 def momentum(rounds: int) -> list[float]:
@@ -115,92 +155,112 @@ def momentum(rounds: int) -> list[float]:
     return found
 
 
-def _row(tensor: Tensor, kind: Any = wp.vec3) -> wp.array:
-    """(..., 3) as one row of points, or (..., 4) of planes."""
-    return wp.from_torch(tensor.reshape(-1, tensor.shape[-1]), dtype=kind)
+def _array(tensor: Tensor, kind: Any) -> wp.array:
+    """(..., 3, LANES) as a row of tiles, (..., LANES) of lanes, or of single numbers."""
+    shape = {Tile: (-1, 3, LANES), Lanes: (-1, LANES), wp.float32: (-1,)}[kind]
+    return wp.from_torch(tensor.view(shape), dtype=kind)
 
 
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, before: Tensor, now: Tensor, lengths: Tensor, above: Tensor, edges: EdgeProjection,
-        momentum: list[float],
+        ctx: Any, before: Tensor, now: Tensor, lengths: Tensor, normals: Tensor, heights: Tensor,
+        edges: EdgeProjection, momentum: list[float],
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         learning = any(ctx.needs_input_grad)
-        slots = len(momentum) + 2 if learning else 3  # which stay in the cache
+        slots = len(momentum) + 2 if learning else 2  # which stay in the cache
         at = now.new_empty(slots, *now.shape)
         at[0], at[1] = before, now
-        arrays = [_row(above.detach(), wp.vec4), _row(at)]
+        on = [_array(normals, Tile), _array(heights.detach(), Lanes)]
+        draw = edges.launch(_draw, len(now), [*on, _array(at, Tile), _array(at, wp.float32)])
         for k, gain in enumerate(momentum):
-            edges.run(_draw, len(now), arrays, *((k + n) % slots for n in range(3)), gain)
+            draw(*((k + n) % slots for n in range(3)), gain)
+        last, end = (at[(len(momentum) + n) % slots] for n in range(2))
+        if not learning:
+            return last, end
         ctx.edges, ctx.momentum = edges, momentum
-        if learning:
-            ctx.save_for_backward(at, above.detach())
-        return at[len(momentum) % slots].clone(), at[(len(momentum) + 1) % slots].clone()
+        ctx.save_for_backward(at, normals, heights.detach())
+        return last.clone(), end.clone()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         edges: EdgeProjection = ctx.edges
-        at, above = ctx.saved_tensors
-        found = torch.zeros_like(at)
+        at, normals, heights = ctx.saved_tensors
+        found, pulls = torch.zeros_like(at), torch.empty_like(normals)
         found[-2], found[-1] = grads
-        slope = at.new_zeros(at.shape[1], len(edges.edge_of_half) if ctx.needs_input_grad[2] else 0)
-        of_planes = torch.zeros_like(above)
-        moving, still = [_row(at), _row(found)], [_row(t, wp.vec4) for t in (above, of_planes)]
+        of_heights = torch.zeros_like(heights)
+        slope = at.new_zeros(at.shape[1], edges.rows if ctx.needs_input_grad[2] else 0, LANES)
+        on = [_array(t, Lanes) for t in (heights, of_heights)]
+        moving = [_array(at, Tile), _array(at, wp.float32), _array(found, Tile), _array(pulls, Tile)]
+        leave = edges.launch(_leave_back, at.shape[1], [_array(normals, Tile), *on, *moving])
+        draw = edges.launch(_draw_back, at.shape[1], [*moving, _array(pulls, wp.float32), _array(slope, Lanes)])
         for k, gain in reversed(list(enumerate(ctx.momentum))):
-            if above.numel():
-                edges.run(_leave_back, at.shape[1], [*still, *moving], k, gain)
-            edges.run(_draw_back, at.shape[1], [*moving, wp.from_torch(slope.view(-1))], k, gain)
+            leave(k, gain)
+            draw(k, gain)
         of_lengths = None
         if slope.numel():
             of_lengths = torch.zeros_like(edges.lengths)
-            of_lengths.index_add_(0, edges.edge_of_half, slope.sum(0).to(of_lengths))
+            of_halves = slope.sum(0).flatten()[edges.place_of_half]
+            of_lengths.index_add_(0, edges.edge_of_half, of_halves.to(of_lengths))
             of_lengths *= 2 * edges.lengths.detach()
-        return found[0], found[1], of_lengths, of_planes, None, None
+        return found[0], found[1], of_lengths, None, of_heights, None, None
 
 
 # Edges are told one by one: as a struct, a round by itself took a third longer, or more.
 
 
 @wp.func
-def _vertex(t: int, count: int) -> int:
-    # Of one drape, all threads are spared the division.
-    i = int(t)
-    if t >= count:
-        i = t % count
-    return i
+def _gathered(at: wp.array(dtype=float), base: int, places: Places) -> Tile:
+    out = Tile()
+    for lane in range(LANES):
+        for k in range(3):
+            out[k, lane] = at[base + places[lane] + LANES * k]
+    return out
+
+
+@wp.func
+def _dot(one: Tile, other: Tile) -> Lanes:
+    return wp.vec3(1.0, 1.0, 1.0) @ wp.cw_mul(one, other)
+
+
+@wp.func
+def _scaled(factors: Lanes, points: Tile) -> Tile:
+    return wp.cw_mul(wp.outer(wp.vec3(1.0, 1.0, 1.0), factors), points)
 
 
 @wp.func
 def _drawn(
     first: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    squares: wp.array(dtype=float),
-    share: float,
-    at: wp.array(dtype=wp.vec3),
-    i: int,
+    other: wp.array(dtype=Places),
+    squares: wp.array(dtype=Lanes),
+    share: Lanes,
+    at: wp.array(dtype=Tile),
+    numbers: wp.array(dtype=float),
+    g: int,
     now: int,
     before: int,
     gain: float,
-) -> wp.vec3:
+) -> Tile:
     # (q - L²) / (q + L²) is 1 - L / l to the second order of the strain, has no root, and no pole where ends meet.
     x = at[now]
-    asked = wp.vec3(0.0, 0.0, 0.0)
-    for h in range(first[i], first[i + 1]):
-        away = x - at[now + other[h]]
-        q = wp.length_sq(away)
-        asked += away * ((q - squares[h]) / (q + squares[h]))
-    return at[before] + gain * (x - share * asked - at[before])
+    asked = Tile()
+    for h in range(first[g], first[g + 1]):
+        away = x - _gathered(numbers, (now - g) * 3 * LANES, other[h])
+        q = _dot(away, away)
+        asked += _scaled(wp.cw_div(q - squares[h], q + squares[h]), away)
+    return at[before] + gain * (x - _scaled(share, asked) - at[before])
 
 
 @wp.kernel
 def _draw(
     first: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    squares: wp.array(dtype=float),
-    shares: wp.array(dtype=float),
-    above: wp.array(dtype=wp.vec4),
-    at: wp.array(dtype=wp.vec3),
+    other: wp.array(dtype=Places),
+    squares: wp.array(dtype=Lanes),
+    shares: wp.array(dtype=Lanes),
+    normals: wp.array(dtype=Tile),
+    heights: wp.array(dtype=Lanes),
+    at: wp.array(dtype=Tile),
+    numbers: wp.array(dtype=float),
     all: int,
     before: int,
     now: int,
@@ -208,32 +268,31 @@ def _draw(
     gain: float,
     start: int,
 ):
-    # The last states lie in the slots before and now, the next one comes into after.
+    # The last states lie in the slots before and now, the next one comes into after, which may be before. What is held
+    # stays: it was in one place before and now, nothing draws it, and planes are kept from it.
     t = start + wp.tid()
-    i = _vertex(t, shares.shape[0])
-    share = shares[i]
-    x = at[now * all + t]
-    if share > 0.0:
-        x = _drawn(first, other, squares, share, at, i, now * all + t, before * all + t, gain)
-        if above.shape[0] > 0:
-            plane = above[t]
-            normal = wp.vec3(plane[0], plane[1], plane[2])
-            lack = plane[3] - wp.dot(x, normal)
-            if lack > 0.0:
-                x += normal * wp.min(lack, LONGEST)
-    at[after * all + t] = x
+    g = t % shares.shape[0]
+    share = shares[g]
+    x = _drawn(first, other, squares, share, at, numbers, g, now * all + t, before * all + t, gain)
+    push = heights[t] - _dot(x, normals[t])
+    for lane in range(LANES):
+        push[lane] = wp.where(share[lane] > 0.0, wp.clamp(push[lane], 0.0, LONGEST), 0.0)
+    at[after * all + t] = x + _scaled(push, normals[t])
 
 
 @wp.kernel
 def _leave_back(
     first: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    squares: wp.array(dtype=float),
-    shares: wp.array(dtype=float),
-    above: wp.array(dtype=wp.vec4),
-    of_planes: wp.array(dtype=wp.vec4),
-    at: wp.array(dtype=wp.vec3),
-    grad: wp.array(dtype=wp.vec3),
+    other: wp.array(dtype=Places),
+    squares: wp.array(dtype=Lanes),
+    shares: wp.array(dtype=Lanes),
+    normals: wp.array(dtype=Tile),
+    heights: wp.array(dtype=Lanes),
+    of_heights: wp.array(dtype=Lanes),
+    at: wp.array(dtype=Tile),
+    numbers: wp.array(dtype=float),
+    grad: wp.array(dtype=Tile),
+    pulls: wp.array(dtype=Tile),
     all: int,
     k: int,
     gain: float,
@@ -241,28 +300,31 @@ def _leave_back(
 ):
     # What was brought to its plane is moved out or in by the plane alone.
     t = start + wp.tid()
-    i = _vertex(t, shares.shape[0])
-    share = shares[i]
-    if share > 0.0:
-        now = (k + 1) * all + t
-        plane = above[t]
-        normal = wp.vec3(plane[0], plane[1], plane[2])
-        lack = plane[3] - wp.dot(_drawn(first, other, squares, share, at, i, now, now - all, gain), normal)
-        if lack > 0.0 and lack < LONGEST:
-            out = wp.dot(normal, grad[now + all])
-            grad[now + all] = grad[now + all] - out * normal
-            of_planes[t] = of_planes[t] + wp.vec4(0.0, 0.0, 0.0, out)
+    g = t % shares.shape[0]
+    now = (k + 1) * all + t
+    share, own = shares[g], grad[now + all]
+    lack = heights[t] - _dot(_drawn(first, other, squares, share, at, numbers, g, now, now - all, gain), normals[t])
+    out = _dot(normals[t], own)
+    for lane in range(LANES):
+        out[lane] = wp.where(share[lane] > 0.0 and lack[lane] > 0.0 and lack[lane] < LONGEST, out[lane], 0.0)
+    of_heights[t] = of_heights[t] + out
+    left = own - _scaled(out, normals[t])
+    grad[now + all] = left
+    pulls[t] = _scaled(share, left)
 
 
 @wp.kernel
 def _draw_back(
     first: wp.array(dtype=int),
-    other: wp.array(dtype=int),
-    squares: wp.array(dtype=float),
-    shares: wp.array(dtype=float),
-    at: wp.array(dtype=wp.vec3),
-    grad: wp.array(dtype=wp.vec3),
-    slope: wp.array(dtype=float),
+    other: wp.array(dtype=Places),
+    squares: wp.array(dtype=Lanes),
+    shares: wp.array(dtype=Lanes),
+    at: wp.array(dtype=Tile),
+    numbers: wp.array(dtype=float),
+    grad: wp.array(dtype=Tile),
+    pulls: wp.array(dtype=Tile),
+    pull_numbers: wp.array(dtype=float),
+    slope: wp.array(dtype=Lanes),
     all: int,
     k: int,
     gain: float,
@@ -270,21 +332,20 @@ def _draw_back(
 ):
     # What an edge asks for changes with its ends by the symmetric matrix r I + 4 L² / (q + L²)² a a^T.
     t = start + wp.tid()
-    i = _vertex(t, shares.shape[0])
+    g = t % shares.shape[0]
     now = (k + 1) * all + t
-    x, own, share = at[now], grad[now + all], shares[i]
-    back = own
-    if share > 0.0:
-        grad[now - all] = grad[now - all] + (1.0 - gain) * own
-        back = gain * own
-    for h in range(first[i], first[i + 1]):
-        j = now + other[h]
-        away = x - at[j]
-        q, square = wp.length_sq(away), squares[h]
+    x, pull = at[now], gain * pulls[t]
+    back = gain * grad[now + all]
+    grad[now - all] = grad[now - all] + (1.0 - gain) * grad[now + all]
+    for h in range(first[g], first[g + 1]):
+        away = x - _gathered(numbers, (now - g) * 3 * LANES, other[h])
+        differ = pull - gain * _gathered(pull_numbers, (t - g) * 3 * LANES, other[h])
+        q, square = _dot(away, away), squares[h]
         total = q + square
-        differ = gain * (own * share - grad[j + all] * shares[i + other[h]])
-        back -= differ * ((q - square) / total) + away * (4.0 * square / (total * total) * wp.dot(away, differ))
+        steep = wp.cw_div(2.0 * _dot(away, differ), wp.cw_mul(total, total))
+        back -= _scaled(wp.cw_div(q - square, total), differ) + _scaled(2.0 * wp.cw_mul(square, steep), away)
         if slope.shape[0] > 0:
-            place = (t - i) / shares.shape[0] * other.shape[0] + h
-            slope[place] = slope[place] + gain * share * wp.dot(away, own) * 2.0 * q / (total * total)
+            place = t / shares.shape[0] * other.shape[0] + h
+            steep = wp.cw_div(2.0 * _dot(away, pull), wp.cw_mul(total, total))
+            slope[place] = slope[place] + wp.cw_mul(q, steep)
     grad[now] = grad[now] + back

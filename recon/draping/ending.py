@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon.cloth.beside import Surface
+from recon.cloth.beside import Start, Surface
 from recon.cloth.edges import EdgeProjection
 from recon.cloth.energies import rest_edges
 from recon.draping.dress import held_vertices
@@ -35,8 +35,8 @@ class Ending:
     edges: EdgeProjection
     surface: Surface
     """The body's."""
-    start: Tensor
-    """(V,) the body's vertices that are nearest to the garment's at rest."""
+    start: Start
+    """The body's vertices that are nearest to the garment's at rest."""
 
     @classmethod
     def of(cls, garment: Garment, surface: Surface, rounds: int = ROUNDS) -> Ending:

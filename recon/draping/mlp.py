@@ -50,7 +50,7 @@ def quickly(net: nn.Sequential | list[Linear], x: Tensor, fine: bool = True) -> 
     ``fine``: the last one in full; else in halves too.
     """
     (first, shift), *inner, (last, add) = layers_of(net) if isinstance(net, nn.Sequential) else net
-    halves = torch.bfloat16 if halves_are_fast(x.device) and x.dtype == torch.float32 else x.dtype
+    halves = torch.bfloat16 if halves_are_fast(x.device, vectors=True) and x.dtype == torch.float32 else x.dtype
     hidden = [(weight.to(halves), bias.to(halves)) for weight, bias in inner]
     out = x.new_empty(len(x), len(add))
     for rows, part in zip(out.split(CHUNK), x.split(CHUNK), strict=True):

@@ -20,10 +20,14 @@ CHUNK = 4096
 """Points per pass: the activations of one layer stay in a core's cache."""
 
 
-def halves_are_fast(device: torch.device) -> bool:
-    """Whether products of bfloat16 matrices cost far less than those of floats: on CPUs with tiles for them (AMX)."""
+def halves_are_fast(device: torch.device, vectors: bool = False) -> bool:
+    """Whether products of bfloat16 matrices cost far less than those of floats: on CPUs with tiles for them (AMX).
+
+    ``vectors``: or with vector instructions (AVX-512), two fifths; what is lost between products may outweigh that.
+    """
     known = getattr(torch.cpu, "get_capabilities", None)
-    return device.type == "cpu" and known is not None and bool(known().get("amx_bf16"))
+    names = ("amx_bf16", "avx512_bf16") if vectors else ("amx_bf16",)
+    return device.type == "cpu" and known is not None and any(map(known().get, names))
 
 
 @dataclass(frozen=True)
