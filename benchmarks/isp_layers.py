@@ -36,11 +36,9 @@ from recon.bodies.retarget import motion_of
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import Crossings
-from recon.draping.apart import draw_apart
 from recon.draping.isp import IspDraper, load_isp_draper
 from recon.draping.layering import Beneath, Layering, Raster, load_layering, settled
 from recon.draping.projected import ProjectedDraper
-from recon.draping.skinning import SkinningDraper
 from recon.files.motions import read_clip
 from recon.files.weights import read_manifest
 from recon.garments import load_decoder
@@ -67,11 +65,9 @@ class Size:
     """Bodies of each outfit."""
     resolution: int
     """Cells of the grid that garments are cut on."""
-    tangled: int
-    """Outfits of each first layer whose two innermost layers go through untangling; a quarter of them with all five."""
 
 
-FULL, QUICK = Size(25, 4, 80, 4), Size(1, 2, 48, 0)
+FULL, QUICK = Size(25, 4, 80), Size(1, 2, 48)
 
 
 def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> BodyPose:
@@ -79,7 +75,7 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
 
     ``clear``: limbs turned until they don't pass through the body, each by its own shape.
     """
-    generator = torch.Generator().manual_seed(UNSEEN + seed)
+    generator = torch.Generator().manualseed_of(UNSEEN + seed)
     pose = sample_poses(count, generator)
     if CLIP.is_file():
         frames = motion_of(read_clip(CLIP), body, 30.0).pose
@@ -93,7 +89,7 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:
     """Garments of codes between learned ones that no training drew."""
     decoder = load_decoder(kind)
-    generator = torch.Generator().manual_seed(UNSEEN + seed)
+    generator = torch.Generator().manualseed_of(UNSEEN + seed)
     with torch.no_grad():
         return [decoder.decode(between(decoder.codes, generator), resolution) for _ in range(count)]
 
@@ -162,7 +158,7 @@ def drapes_alone(size: Size, body: Body, draper: IspDraper, layering: Layering, 
     rows = []
     for kind in FIRST:
         for group in range(size.groups):
-            seed = _seed(kind, group)
+            seed = seed_of(kind, group)
             garments = [unseen_garments(k, 1, size.resolution, seed)[0] for k in (kind, "top")]
             rows += alone(garments, body.pose(unseen_bodies(size.bodies, body, seed)), body, draper, layering)
     for group in range(dresses):
@@ -171,20 +167,19 @@ def drapes_alone(size: Size, body: Body, draper: IspDraper, layering: Layering, 
     return rows
 
 
-def _seed(kind: str, group: int) -> int:
+def seed_of(kind: str, group: int) -> int:
+    """The seed of an outfit and its bodies."""
     return 100 * group + 7 * list(FIRST).index(kind)
 
 
 def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Layering, say) -> dict:
     """One of the two tables, each way."""
     ways: dict[str, list[np.ndarray]] = {"without": [], "forces": [], "with": []}
-    clean: dict[str, list[dict]] = {"2": [], "5": []}
     for group in range(size.groups):
-        seed = _seed(kind, group)
+        seed = seed_of(kind, group)
         garments = unseen_garments(kind, 1, size.resolution, seed) + unseen_garments("top", TOPS, size.resolution, seed)
         with torch.no_grad():
-            bodies = unseen_bodies(size.bodies, body, seed)
-            posed = body.pose(bodies)
+            posed = body.pose(unseen_bodies(size.bodies, body, seed))
             drapes = [draper.drape(g, posed) for g in garments]
             outcomes = {
                 "without": drapes,
@@ -193,10 +188,6 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
             }
         for way, layers in outcomes.items():
             ways[way].append(table(layers, posed, body))
-        for count, found in clean.items():
-            if len(found) < size.tangled // {"2": 1, "5": 4}[count]:
-                place = BodyPose(*(t[:1] for t in vars(bodies).values()))
-                found.append(drawn_apart(garments[: int(count)], outcomes["with"], body, place, draper.skinning))
         say(f"{kind}: outfit {group + 1} of {size.groups}")
     tables = {way: np.concatenate(found, 1) for way, found in ways.items()}
     figures: dict = {
@@ -210,33 +201,7 @@ def layered(kind: str, size: Size, body: Body, draper: IspDraper, layering: Laye
         for way, found in tables.items()
     }
     figures["cases"] = size.groups * size.bodies
-    figures["untangled"] = {
-        count: {"cases": len(found), "clean": sum(c["clean"] for c in found), "each": found}
-        for count, found in clean.items()
-        if found
-    }
     return figures
-
-
-def drawn_apart(
-    garments: Sequence[Garment], layers: Sequence[Mesh], body: Body, pose: BodyPose, skinning: SkinningDraper
-) -> dict:
-    """The first body's innermost layers after untangling, checked exactly; what the body does to itself in the pose."""
-    here = [m.with_vertices(m.vertices[0]) for m in layers[: len(garments)]]
-    began = time.perf_counter()
-    apart = draw_apart(garments, here, body, pose, skinning)
-    skin = body.pose(pose).mesh.vertices[0].double().numpy()
-    test = Crossings(body.faces.numpy(), len(skin))
-    return {
-        "before": apart.before,
-        "after": len(apart.done.left),
-        "inside": apart.done.inside,
-        "clean": apart.done.clean,
-        "dressed": apart.dressed,
-        "strain": round(apart.done.strain, 4),
-        "body_through_itself": len(test.pairs(test(skin))),
-        "seconds": round(time.perf_counter() - began, 1),
-    }
 
 
 def drape_ms(
@@ -303,7 +268,7 @@ def measure(
         before: an earlier result whose tables are kept; only garments alone and times are measured anew.
     """
     size = QUICK if quick else FULL
-    size = replace(size, groups=outfits, tangled=min(size.tangled, outfits // 4)) if outfits else size
+    size = replace(size, groups=outfits) if outfits else size
     body = load_body()
     draper, layering = load_isp_draper(body, folder), load_layering(folder)
     figures: dict = {"tables": {}, "pose_source": "held-out clip and random" if CLIP.is_file() else "random"}
@@ -382,8 +347,7 @@ def page(figures: dict) -> str:
                     f"| {i + 1} | " + " | ".join(f"{v:.3f}" if j >= i else "" for j, v in enumerate(row)) + " |"
                 )
             lines.append("")
-        for count, u in (t.get("untangled") or {}).items():
-            lines += [f"{count} layers, untangled: nothing crosses in {u['clean']} of {u['cases']}.", ""]
+    lines += ["What untangling makes of such outfits: [isp-untangled.md](isp-untangled.md).", ""]
     return "\n".join([*lines, *_curves(), CURVE]) + "\n"
 
 
