@@ -75,7 +75,7 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
 
     ``clear``: limbs turned until they don't pass through the body, each by its own shape.
     """
-    generator = torch.Generator().manualseed_of(UNSEEN + seed)
+    generator = torch.Generator().manual_seed(UNSEEN + seed)
     pose = sample_poses(count, generator)
     if CLIP.is_file():
         frames = motion_of(read_clip(CLIP), body, 30.0).pose
@@ -89,7 +89,7 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:
     """Garments of codes between learned ones that no training drew."""
     decoder = load_decoder(kind)
-    generator = torch.Generator().manualseed_of(UNSEEN + seed)
+    generator = torch.Generator().manual_seed(UNSEEN + seed)
     with torch.no_grad():
         return [decoder.decode(between(decoder.codes, generator), resolution) for _ in range(count)]
 
