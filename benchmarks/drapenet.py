@@ -38,12 +38,13 @@ from draping import tube
 from isp_layers import ROOT, unseen_bodies
 
 from recon.bodies import Body, load_body
+from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, bending, gravity, stvk
 from recon.draping.drapenet import DrapeNetDraper, DrapeNets, Known, load_drapenet
 from recon.draping.dress import dress
 from recon.draping.ending import Ending
-from recon.draping.layering import Beneath, settled
+from recon.draping.layering import settled
 from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
 from recon.files.weights import read_manifest

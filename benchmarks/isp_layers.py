@@ -33,11 +33,12 @@ from recon.bodies import Body, load_body
 from recon.bodies.clearance import clear_bodies
 from recon.bodies.pose_prior import sample_poses
 from recon.bodies.retarget import motion_of
+from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import Crossings
 from recon.draping.isp import IspDraper, load_isp_draper
-from recon.draping.layering import Beneath, Layering, Raster, load_layering, settled
+from recon.draping.layering import Layering, Raster, load_layering, settled
 from recon.draping.projected import ProjectedDraper
 from recon.files.motions import read_clip
 from recon.files.weights import read_manifest

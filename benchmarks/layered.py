@@ -29,7 +29,7 @@ from truth import SIZE, TRUSTED, Found, Truth, fit_truth, make_truth
 
 from pipelines.palette import SKIN, layer_colour
 from pipelines.photo import PhotoFit, load_models
-from recon.draping.layering import Beneath
+from recon.cloth.beneath import Beneath
 from recon.files.atomic import write_whole
 from recon.files.masks import read_masks
 from recon.metrics import beneath_pct, compare_meshes, sample_surface, surface_distance

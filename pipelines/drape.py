@@ -19,6 +19,7 @@ from pipelines.palette import SKIN, layer_colour
 from pipelines.pose_source import load_pose
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import Clearing, clear_motion
+from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, stvk
 from recon.cloth.intersections import self_intersections
@@ -26,7 +27,7 @@ from recon.cloth.projective import Projecting
 from recon.draping import DRAPERS, Draper, load_draper
 from recon.draping.apart import Apart, draw_apart
 from recon.draping.isp import IspDraper
-from recon.draping.layering import Beneath, Layering, load_layering
+from recon.draping.layering import Layering, load_layering
 from recon.draping.openings import Openings
 from recon.draping.projected import ANY_POSE, ProjectedDraper
 from recon.draping.skinning import SkinningDraper
@@ -233,7 +234,7 @@ def drape_each(
         if chosen not in drapers:
             plain = isp if chosen == "isp" and isp is not None else load_draper(chosen, body, folder)
             drapers[chosen] = ProjectedDraper(plain, skinning, projecting) if config.steps else plain
-        garment = thing if isinstance(thing, Garment) else Garment.bare("", thing)
+        garment = Garment.of(thing)
         drapes.append(drapers[chosen].drape(garment, posed, under=drapes))
         how.append(chosen)
     return how, drapes

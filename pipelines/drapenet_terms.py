@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from recon.bodies import Body
-from recon.draping.layering import Beneath, rim_of, vertex_normals
+from recon.cloth.beneath import Beneath, rim_of, vertex_normals
 from recon.types import Garment, Mesh
 
 COVERED = 0.08

@@ -17,10 +17,11 @@ from pipelines.drape_training import CLIP_TERMS, HELD_OUT, BodySampler, read_mot
 from pipelines.training import Budget, Training, settings_of
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import Clearance
+from recon.cloth.beneath import MARGIN, Beneath, repulsion, rim_of, vertex_normals
 from recon.cloth.energies import collision
 from recon.cloth.frames import FrameWeights
 from recon.draping.isp import Worn, load_isp_draper
-from recon.draping.layering import MARGIN, Beneath, LayeringNet, Raster, repulsion, rim_of, vertex_normals
+from recon.draping.layering import LayeringNet, Raster
 from recon.files.weights import write_weights
 from recon.garments import load_decoder
 from recon.types import Mesh, PosedBody, UserError

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
-from recon.draping.layering import Beneath
 from recon.types import Garment, Mesh
 
 

@@ -150,6 +150,11 @@ class Garment:
         none = torch.zeros(0, dtype=torch.long, device=mesh.faces.device)
         return Garment(kind, mesh, mesh.vertices.detach().new_zeros(0, 2), none.view(0, 3), none, none, none)
 
+    @staticmethod
+    def of(thing: Garment | Mesh) -> Garment:
+        """The garment itself, or a mesh at rest in a garment's place."""
+        return thing if isinstance(thing, Garment) else Garment.bare("", thing)
+
     @property
     def has_panels(self) -> bool:
         """Whether it was cut from panels that are known."""

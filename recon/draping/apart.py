@@ -68,7 +68,7 @@ def draw_apart(
     if first.clean:
         return _ended(drapes, posed, first, first, False)
     say("what networks draped can't be untangled: dressed by simulation")
-    ends = _simulated([_bare(g) for g in reversed(garments)], body, pose, skinning)
+    ends = _simulated([Garment.of(g) for g in reversed(garments)], body, pose, skinning)
     again = [mesh.with_vertices(torch.from_numpy(x).to(mesh.vertices)) for mesh, x in zip(drapes, ends[::-1])]
     plain = untangle(again[::-1], worn, Untangling(tries=1, rounds=0))
     tried = plain if plain.clean else untangle(again[::-1], worn, Untangling(tries=TRIES))
@@ -93,10 +93,6 @@ def _simulated(garments: Sequence[Garment], body: Body, pose: BodyPose, skinning
         return [x[-1] for x in way.garments]
     clean = [mesh.with_vertices(torch.from_numpy(x)) for mesh, x in zip(begin, start.vertices)]
     return follow(clean, np.concatenate(way.garments, 1), way.bodies, body.faces.cpu())
-
-
-def _bare(garment: Garment | Mesh) -> Garment:
-    return Garment.bare("", garment) if isinstance(garment, Mesh) else garment
 
 
 def _ended(layers: Sequence[Mesh], posed: PosedBody, done: Untangled, first: Untangled, dressed: bool) -> Apart:

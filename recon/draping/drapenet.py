@@ -21,10 +21,11 @@ from torch import Tensor, nn
 
 from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
+from recon.cloth.beneath import Beneath
 from recon.draping.body_field import JOINTS, BodyFieldNet
 from recon.draping.ending import Ending
 from recon.draping.isp import pose_features
-from recon.draping.layering import Beneath, settled
+from recon.draping.layering import settled
 from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
 from recon.draping.nodes import Nodes
 from recon.draping.rest_code import RestCode

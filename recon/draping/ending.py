@@ -20,10 +20,9 @@ ROUNDS = 24
 """Rounds that end a drape; on the coarse garments that networks learn on, half as many reach as far."""
 
 
-def edges_of(garment: Garment | Mesh, rounds: int) -> EdgeProjection:
+def edges_of(thing: Garment | Mesh, rounds: int) -> EdgeProjection:
     """Edge projection of a garment whose waistband stays; of a mesh without panels with the lengths that it has."""
-    if isinstance(garment, Mesh):
-        garment = Garment.bare("", garment)
+    garment = Garment.of(thing)
     held = torch.as_tensor(held_vertices(garment))
     return EdgeProjection(*rest_edges(garment), len(garment.mesh.vertices), rounds, held)
 

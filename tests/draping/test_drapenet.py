@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from recon.bodies import load_body
+from recon.cloth.beneath import Beneath
 from recon.draping.drapenet import (
     DrapeNetDraper,
     DrapeNets,
@@ -18,7 +19,6 @@ from recon.draping.drapenet import (
     under_top,
     widened,
 )
-from recon.draping.layering import Beneath
 from recon.draping.mlp import waves
 from recon.draping.rest_code import RestCode
 from recon.files.weights import write_weights

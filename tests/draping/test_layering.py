@@ -6,19 +6,9 @@ import pytest
 import torch
 
 from recon.bodies.rig import rotation_matrices
+from recon.cloth.beneath import REACH, Beneath, repulsion, vertex_normals
 from recon.cloth.contact import BodyContact
-from recon.draping.layering import (
-    CHANNELS,
-    REACH,
-    Beneath,
-    Layering,
-    LayeringNet,
-    Raster,
-    frames_of,
-    inputs_of,
-    repulsion,
-    vertex_normals,
-)
+from recon.draping.layering import CHANNELS, Layering, LayeringNet, Raster, frames_of, inputs_of
 from recon.files.weights import write_weights
 from recon.metrics import beneath_pct, inside_pct
 from recon.types import Mesh, UserError
