@@ -30,9 +30,9 @@ class DatasetMake:
     """Tank tops, T-shirts, shirts and jackets to train on."""
     skirts: int = 300
     """Skirts to train on."""
-    trousers: int = 200
+    trousers: int = 400
     """Trousers and shorts to train on."""
-    dresses: int = 100
+    dresses: int = 400
     """Dresses to train on."""
     shirts6: int = 0
     """Shirts of six panels to train on."""

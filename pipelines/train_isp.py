@@ -20,7 +20,7 @@ from torch import Tensor
 
 from pipelines.isp_samples import GRID, IspSamples, collect, frame
 from pipelines.training import Budget, Training, settings_of
-from recon.files.weights import write_weights
+from recon.files.weights import read_manifest, write_weights
 from recon.garments.dataset import Item, load_items
 from recon.garments.isp import IspDecoder, Variant, load_isp
 from recon.garments.isp_net import IspNets, IspShape
@@ -301,4 +301,7 @@ def store(decoder: IspDecoder, config: TrainIsp, done: Training, metrics: dict[s
         "licence": "CC0-1.0",
         "metrics": metrics,
     }
+    if config.start is not None:
+        earlier = read_manifest(config.start)[f"isp-{config.kind}"]
+        card["before"] = {key: earlier[key] for key in ("data", "steps", "minutes", "before") if key in earlier}
     return write_weights(f"isp-{config.kind}", tensors, card, config.out)

@@ -47,6 +47,13 @@ def test_measures_scale_with_the_body(measures: Measures) -> None:
         assert len(drawn(variant, large, edge_length=0.03).points) > 100
 
 
+def test_shorts_of_a_low_crotch_have_a_hem_below_it(measures: Measures) -> None:
+    """Wide ones on a long crotch used to have a shortest hem above their longest."""
+    for seed in range(300):
+        sizes = patterns.sample("shorts", seed, measures)
+        assert sizes["hem_y"] < sizes["crotch_y"] - 0.03
+
+
 @pytest.mark.parametrize(("kind", "variant"), VARIANTS)
 def test_panels_are_sound(kind: str, variant: str, measures: Measures) -> None:
     p = drawn(variant, measures)
