@@ -46,7 +46,7 @@ HEADS = {
 
 def direction_error(decoder: UdfDecoder, code: torch.Tensor, points: torch.Tensor, normals: torch.Tensor) -> float:
     """Median angle between the field's gradient a centimetre off the surface and the surface's normal [degrees]."""
-    slope = decoder.field(code).slope(points + 0.01 * normals)[1]
+    slope = decoder.field(code).slope(decoder.spread(points + 0.01 * normals))[1]
     cosine = torch.nn.functional.cosine_similarity(slope, normals).clamp(-1, 1)
     return float(torch.rad2deg(cosine.acos()).median())
 
@@ -56,7 +56,7 @@ def measured(decoder: UdfDecoder, number: int, item: Item, path: Path) -> dict[s
     truth, code = item.garment.mesh, decoder.all_codes[number]
     points, normals = sample_surface(truth, 4000, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        row = {"field_mm": 1e3 * float(decoder.field(code)(points).mean())}
+        row = {"field_mm": 1e3 * float(decoder.field(code)(decoder.spread(points)).mean())}
     row["slope_deg"] = direction_error(decoder, code, points, normals)
     try:
         found = decoder.decode(code, 96).mesh

@@ -144,14 +144,14 @@ def _learned(config: Encode, decoder: UdfDecoder) -> Tensor:
 def _start(config: Encode, decoder: UdfDecoder, latent: Tensor, points: Tensor) -> tuple[Tensor, float]:
     """The best of a code and all learned ones, and its misfit."""
     codes = torch.cat([latent[None], _learned(config, decoder)])
-    return best_start(decoder, codes, points, decoder.nets.shape.reach)
+    return best_start(decoder, codes, decoder.spread(points), decoder.nets.shape.reach)
 
 
 def _searched(config: Encode, decoder: UdfDecoder, latent: Tensor, points: Tensor) -> Tensor:
     """The code refined, from the encoder's and from the learned one that fits best; the better of both ends."""
     reach, how = decoder.nets.shape.reach, CodeSearch(config.refine, far=0.1, stay=0.0, prior=PRIOR)
     start = _start(config, decoder, latent, points)[0]
-    starts = [latent] if torch.equal(start, latent) else [latent, start]
+    starts, points = [latent] if torch.equal(start, latent) else [latent, start], decoder.spread(points)
     ends = torch.stack([refined(decoder, z, points, reach, how) for z in starts])
     return best_start(decoder, ends, points, reach)[0]
 
@@ -171,11 +171,11 @@ def _places(config: Encode, decoder: UdfDecoder, mesh: Mesh, up: str, turned: bo
 
 
 def _guess(config: Encode, decoder: UdfDecoder, points: Tensor, shift: Tensor, up: str, turned: bool) -> Guess:
-    at = points + shift
+    at, reach = points + shift, decoder.nets.shape.reach
     latent = decoder.encode(at)
     codes = _learned(config, decoder)
     beside = codes[nearest(codes, latent, BESIDE)]
-    latent, misfit = best_start(decoder, torch.cat([latent[None], beside]), at, decoder.nets.shape.reach)
+    latent, misfit = best_start(decoder, torch.cat([latent[None], beside]), decoder.spread(at), reach)
     return Guess(decoder, up, turned, False, shift, at, latent, misfit)
 
 
@@ -204,7 +204,7 @@ def _told(config: Encode, best: Guess) -> list[str]:
 def _report(config: Encode, best: Guess, latent: Tensor, points: Tensor) -> dict[str, Any]:
     decoder = best.decoder
     with torch.no_grad():
-        distance = 1e3 * float(decoder.field(latent)(points).mean())
+        distance = 1e3 * float(decoder.field(latent)(decoder.spread(points)).mean())
     alike = int(nearest(decoder.all_codes, latent)[0])
     kind = decoder.known[alike].kind if config.kind == "auto" else config.kind
     card = read_weights(f"udf-{family_of(kind)}", config.weights).card

@@ -52,7 +52,7 @@ def reconstruct(
     except UserError:
         return {}
     with torch.no_grad():
-        field = decoder.field(code)(points)
+        field = decoder.field(code)(decoder.spread(points))
     figures = compare_meshes(found, truth, generator, 4000)
     faces = found.faces.numpy()
     return {

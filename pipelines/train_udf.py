@@ -19,13 +19,15 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from pipelines.training import Budget, Training, settings_of
-from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect, sides_of
+from pipelines.udf_samples import Sampling, UdfSamples, bounds, collect, sides_of, spread_mesh
 from recon.files.weights import read_weights, write_weights
 from recon.garments.dataset import Item, load_items
 from recon.garments.udf import FAMILIES, Known, Sided, UdfDecoder
 from recon.garments.udf_net import UdfNets, UdfShape
 from recon.types import UserError
 
+APART = {"lower": 0.03}
+"""Families -> how far their sides are moved apart for the networks [m]; others: not. Trousers' legs may touch."""
 NOISE = 0.05
 """Deviation of what is added to codes in training: codes beside one another describe garments alike."""
 
@@ -54,6 +56,9 @@ class TrainUdf:
     """Networks that train on a CPU core, or those of the paper (days on a CPU)."""
     head: Literal["pair", "sigmoid"] = "pair"
     """The compact decoder's output; the paper's is a sigmoid."""
+    apart: float | None = None
+    """How far what is left and right of the middle plane is moved apart for the networks [m]; by default 0.03 for lower
+    garments, whose legs may touch, and 0 for others."""
     width: int = 128
     """Units per layer of the compact decoder."""
     batch: int = 8
@@ -71,7 +76,8 @@ class TrainUdf:
     tie: float = 0.01
     """Weight that keeps free codes near where they begin."""
     begin: Path | None = None
-    """Folder of weights whose networks to begin from, where they have the same sizes."""
+    """Folder of weights whose networks to begin from, where they have the same sizes; and whose codes, where they are
+    of the same garments."""
     loss: Literal["bce", "l1", "l2"] = "bce"
     """Distance loss: binary cross-entropy (Eq. 4), or the alternatives of §7.1."""
     gradient: float = 0.1
@@ -119,12 +125,16 @@ def _items(config: TrainUdf, kind: str, split: str) -> list[Item]:
 def learn(items: Sequence[Item], config: TrainUdf) -> tuple[UdfDecoder, Training]:
     """The training itself, for garments in memory."""
     torch.set_num_threads(config.threads)
-    meshes = [item.garment.mesh for item in items]
+    apart = APART.get(config.family, 0.0) if config.apart is None else config.apart
+    meshes = [spread_mesh(item.garment.mesh, apart) for item in items]
     low, high = bounds(meshes)
     shape = UdfShape.paper(config.family, low, high) if config.size == "paper" else UdfShape(config.family, low, high)
+    shape = replace(shape, apart=apart)
     if config.size == "compact":
         shape = replace(shape, head=config.head, width=config.width)
     samples = collect(meshes, shape, config.sampling, torch.Generator().manual_seed(config.seed))
+    known = [Known(i.garment.kind, i.garment.variant, dict(i.parameters)) for i in items]
+    samples = replace(samples, aims=begun_codes(config, known, samples.aims))
     training = start(shape, config, samples.aims)
     training.resume()
     learner = training.module
@@ -133,10 +143,27 @@ def learn(items: Sequence[Item], config: TrainUdf) -> tuple[UdfDecoder, Training
     learner.train()
     training.run(Budget(config.minutes, config.steps), lambda share: batch_loss(learner, samples, config, generator))
     learner.eval()
-    known = [Known(i.garment.kind, i.garment.variant, dict(i.parameters)) for i in items]
     codes = learner.codes.detach() if config.codes == "free" else codes_of(learner.nets, samples)
     decoder = UdfDecoder(learner.nets, codes, known)
     return UdfDecoder(learner.nets, codes, known, sided=sides_of(decoder, meshes)), training
+
+
+def begun_codes(config: TrainUdf, known: Sequence[Known], aims: Tensor) -> Tensor:
+    """(G, Z) where codes begin: those that ``begin`` stores, if they are of the same garments; else ``aims`` (G, Z)."""
+    if config.begin is None:
+        return aims
+    weights = read_weights(f"udf-{config.family}", config.begin)
+    codes, card = weights.tensors["codes"].float(), described(known)
+    return codes if codes.shape == aims.shape and all(weights.card[k] == v for k, v in card.items()) else aims
+
+
+def described(known: Sequence[Known]) -> dict[str, list[Any]]:
+    """What a card says of the garments that codes stand for (``load_udf`` reads it)."""
+    return {
+        "kinds": [k.kind for k in known],
+        "variants": [k.variant for k in known],
+        "parameters": [{name: round(v, 4) for name, v in k.parameters.items()} for k in known],
+    }
 
 
 class Learner(nn.Module):
@@ -262,9 +289,7 @@ def store(decoder: UdfDecoder, config: TrainUdf, done: Training, metrics: dict[s
     card = {
         "what": f"unsigned distance fields, {config.family} (DGCNN encoder, CBN decoder, {len(decoder.known)} codes)",
         "shape": asdict(decoder.nets.shape),
-        "kinds": [k.kind for k in decoder.known],
-        "variants": [k.variant for k in decoder.known],
-        "parameters": [{k: round(v, 4) for k, v in known.parameters.items()} for known in decoder.known],
+        **described(decoder.known),
         "data": f"{len(decoder.known)} generated garments of kinds {', '.join(FAMILIES[config.family])}",
         "sides": sides_card(decoder.sided),
         "loss": f"{config.loss}, gradient weight {config.gradient}",

@@ -17,6 +17,7 @@ from recon.garments.udf_codes import CodeSearch, refined
 from recon.garments.udf_grid import Box
 from recon.garments.udf_net import CHUNK, Folded, UdfNets, UdfShape
 from recon.garments.udf_sides import beyond_borders, follow_sides, mesh_sides
+from recon.garments.udf_space import gathered, spread
 from recon.types import Garment, Mesh, UserError
 
 FAMILIES: dict[str, tuple[str, ...]] = {"upper": ("top", "dress"), "lower": ("trousers", "skirt")}
@@ -53,7 +54,10 @@ class Sided:
 
 
 class LatentField:
-    """The unsigned distance [m] of one code: a ``udf_grid.Field``, differentiable in points and code."""
+    """The unsigned distance [m] of one code: a ``udf_grid.Field``, differentiable in points and code.
+
+    Points and distances are those of the space that the networks know garments in (``UdfDecoder.spread``).
+    """
 
     def __init__(self, nets: UdfNets, latent: Tensor, half: bool = False, sided: Sided | None = None):
         """
@@ -154,12 +158,16 @@ class UdfDecoder:
         sided = None if self.sided is None else replace(self.sided, turn=self.sided.turn.to(device))
         return UdfDecoder(nets, self.all_codes.to(device), self.known, self._kind, sided)
 
+    def spread(self, points: Tensor) -> Tensor:
+        """(N, 3) [m] on the neutral body -> (N, 3) places in the fields' space, where legs that touch are apart."""
+        return spread(points, self.nets.shape.apart)
+
     def field(self, latent: Tensor, half: bool = False) -> LatentField:
-        """The distance field of a code (Z,); ``half``: faster and coarser where no gradient is wanted."""
+        """The distance field of a code (Z,), of spread points; ``half``: faster and coarser, without gradient."""
         return LatentField(self.nets, latent, half, self.sided)
 
     def decode(self, latent: Tensor, resolution: int = 256) -> Garment:
-        """The garment of a code (Z,), on a grid of ``resolution`` cells along the family's longest side.
+        """The garment of a code (Z,), on a grid of ``resolution`` cells along the family's longest side, spread.
 
         Vertices carry the gradient of MeshUDF §3.3, on the surface and on its borders.
 
@@ -181,7 +189,7 @@ class UdfDecoder:
 
     def decode_like(self, latent: Tensor, garment: Garment) -> Garment:
         """``garment`` re-evaluated at a code nearby: same faces, vertices moved to where the field now is zero."""
-        mesh = garment.mesh.with_vertices(garment.mesh.vertices.detach())
+        mesh = garment.mesh.with_vertices(self.spread(garment.mesh.vertices.detach()))
         frame, own = Frame.of(mesh), latent if garment.latent is None else garment.latent
         with torch.no_grad():
             field, before = self.field(latent.detach()), self.field(own.detach())
@@ -197,9 +205,13 @@ class UdfDecoder:
         return replace(garment, mesh=self._following(latent, mesh, frame), latent=latent)
 
     def _following(self, latent: Tensor, mesh: Mesh, frame: Frame | None = None) -> Mesh:
-        if not (latent.requires_grad and torch.is_grad_enabled()):
-            return mesh
-        frame, field = frame or Frame.of(mesh), self.field(latent)
+        """A mesh of the fields' space taken back into the world, with the code's gradient where it has one."""
+        if latent.requires_grad and torch.is_grad_enabled():
+            mesh = self._moving(latent, mesh, frame or Frame.of(mesh))
+        return mesh.with_vertices(gathered(mesh.vertices, self.nets.shape.apart))
+
+    def _moving(self, latent: Tensor, mesh: Mesh, frame: Frame) -> Mesh:
+        field = self.field(latent)
         if field.sided is None:
             return follow(field, mesh, BESIDE, frame)
         return follow_sides(field, mesh, mesh.vertices.new_zeros(len(frame.border)), frame)
@@ -216,7 +228,7 @@ class UdfDecoder:
         networks call near does not depend on N.
         """
         shape = self.nets.shape
-        x = self.nets.to_domain(points)
+        x = self.nets.to_domain(self.spread(points))
         host = x.cpu().numpy()
         near = cKDTree(host[: shape.points]).query(host, k=shape.neighbours)[1]
         rows = torch.as_tensor(near.astype(np.int32), device=x.device)
@@ -224,7 +236,7 @@ class UdfDecoder:
 
     def refine(self, latent: Tensor, points: Tensor, steps: int = 60, rate: float = 0.03) -> Tensor:
         """The code (Z,) near ``latent`` whose field is smallest at surface points (N, 3) [m] and large elsewhere."""
-        return refined(self, latent, points, self.nets.shape.reach, CodeSearch(steps, rate))
+        return refined(self, latent, self.spread(points), self.nets.shape.reach, CodeSearch(steps, rate))
 
 
 def family_of(kind: str) -> str:

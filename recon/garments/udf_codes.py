@@ -22,7 +22,8 @@ of it elsewhere: no sleeves on a vest."""
 
 @runtime_checkable
 class Fields(Protocol):
-    """What a code is found with: ``UdfDecoder``, or another that has distance fields of codes."""
+    """What a code is found with: ``UdfDecoder``, or another that has distance fields of codes; points are those of its
+    fields' space."""
 
     all_codes: Tensor
 

@@ -30,7 +30,7 @@ class UdfShape:
     family: str
     """Key of ``recon.garments.udf.FAMILIES``."""
     low: tuple[float, float, float]
-    """Lowest corner of the box that holds all garments of the family, on the neutral body [m]."""
+    """Lowest corner of the box that holds all garments of the family on the neutral body, spread by ``apart`` [m]."""
     high: tuple[float, float, float]
     """Highest corner [m]."""
     clip: float = 0.1
@@ -54,6 +54,8 @@ class UdfShape:
     """K: nearest points that an edge convolution looks at."""
     points: int = 768
     """Points whose neighbourhoods are used; an encoder may be asked about more points, with neighbours among these."""
+    apart: float = 0.0
+    """How far ``udf_space.spread`` moves both sides away from the middle for the fields [m]."""
 
     @staticmethod
     def paper(family: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> UdfShape:
@@ -282,9 +284,9 @@ class UdfNets(nn.Module):
         self.encoder, self.decoder = PointEncoder(shape), CbnDecoder(shape)
 
     def to_domain(self, points: Tensor) -> Tensor:
-        """(..., 3) [m] on the neutral body -> domain, about [-1, 1]³."""
+        """(..., 3) [m] on the neutral body, spread -> domain, about [-1, 1]³."""
         return (points - points.new_tensor(self.shape.centre)) / self.shape.half
 
     def to_world(self, x: Tensor) -> Tensor:
-        """(..., 3) domain -> [m]."""
+        """(..., 3) domain -> [m], spread."""
         return x * self.shape.half + x.new_tensor(self.shape.centre)

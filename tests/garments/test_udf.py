@@ -46,6 +46,7 @@ def trained(tmp_path_factory):
         aim=0.03,
         sampling=SAMPLING,
         evaluate=0,
+        apart=0.0,
     )
     tubes = [g for k, g in enumerate(family(6)) if k % 3 != 2]
     return *t.learn(items_of(tubes), config), config, tubes
