@@ -50,6 +50,10 @@ class Following:
     """Distance that layers are drawn apart where a step would make them cross [m]."""
     margin: float = 5e-4
     """Distance kept from the body [m]."""
+    leaving: int = 60
+    """Most steps that only lead out of the body, wherever the simulation has cloth."""
+    barely: float = 1e-4
+    """Distance from the body that these ask for: where its parts pinch cloth there is no room for more [m]."""
 
 
 def follow(
@@ -71,7 +75,7 @@ def follow(
     x = stack.x
     for k in range(1, len(goals)):
         x = way.frame(x, goals[k - 1 : k + 1], Mesh(torch.from_numpy(bodies[k]), faces), k + 1 == len(goals))
-    return stack.split(x)
+    return stack.split(way.out(x))
 
 
 class _Way:
@@ -89,6 +93,20 @@ class _Way:
         self._wear(body, x)
         x = self.tighten.filtered(x, goals[1] - goals[0], False)
         return self._catch_up(x, goals[1], self.settings.last if last else self.settings.rounds)
+
+    def out(self, x: NDArray) -> NDArray:
+        """Of steps from ``x`` (V, 3) that only lead out of the body, crossing nothing, the end with least inside."""
+        self.tighten.margin = self.settings.barely
+        best, least = x, np.inf
+        for number in range(self.settings.leaving + 1):
+            lack = self._lack(x)
+            if lack.sum() < least:
+                best, least = x, lack.sum()
+            if not least:
+                break
+            step = self.tighten.apart(x.copy(), self._around(self._vertices(lack)), number) - x
+            x = self.tighten.filtered(x, step, False)
+        return best
 
     def _wear(self, body: Mesh, x: NDArray) -> None:
         """The body of a frame, around cloth that was outside of the one before."""
@@ -114,11 +132,21 @@ class _Way:
 
     def _behind(self, x: NDArray, goal: NDArray) -> NDArray[np.bool_]:
         """(V,) cloth that is not where it should be or in the body, and what is around it."""
-        body = self.tighten.body
-        assert body is not None
-        lack = body.lack(x)
-        free = (np.linalg.norm(x - goal, axis=1) > OFF) | lack[: len(x)]
-        free[self.faces[lack[len(x) :]]] = True
+        return self._around((np.linalg.norm(x - goal, axis=1) > OFF) | self._vertices(self._lack(x)))
+
+    def _lack(self, x: NDArray) -> NDArray[np.bool_]:
+        """(V + F,) as ``Escape.lack``."""
+        assert self.tighten.body is not None
+        return self.tighten.body.lack(x)
+
+    def _vertices(self, lack: NDArray) -> NDArray[np.bool_]:
+        """(V,) the vertices of what is in the body (V + F,)."""
+        out = lack[: len(lack) - len(self.faces)].copy()
+        out[self.faces[lack[len(out) :]]] = True
+        return out
+
+    def _around(self, free: NDArray) -> NDArray[np.bool_]:
+        """(V,) these vertices and some rings of neighbours."""
         for _ in range(AROUND):
             free[self.edges[free[self.edges].any(1)]] = True
         return free
