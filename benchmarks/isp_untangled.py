@@ -90,7 +90,7 @@ def page(rows: list[dict]) -> str:
         f"`python benchmarks/isp_untangled.py` on {platform.machine()}, {load}.",
     ]
     told = (__doc__ or "").strip().splitlines()
-    lines += ["", *told[told.index("") :][5:8], ""]
+    lines += ["", *told[told.index("") :][4:7], ""]
     lines += [
         "*pairs*: of faces that pass through each other or themselves, all layers together, tested exactly; *inside*:"
     ]
