@@ -16,15 +16,8 @@ from torch import Tensor
 from recon.bodies.rig import JOINT_NAMES
 from recon.types import PosedBody
 
-HINGES = tuple(
-    tuple(tuple(f"{side}_{name}" for name in group) for group in ((joint, *beyond), (before,), (end,)))
-    for side in "lr"
-    for joint, beyond, before, end in (
-        ("elbow", ("wrist", "hand"), "shoulder", "wrist"),
-        ("knee", ("ankle", "foot"), "hip", "ankle"),
-    )
-)
-"""Joints that carry the skin beyond the bend (the bending one first), the one before it, and the limb's end."""
+HINGES = (("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot"))
+"""Joints along a limb: the one before the bend, the bending one, and those beyond it."""
 SLOT = 0.008
 """Room between the two halves [m]: some layers of cloth on either side."""
 SHARP = (1.0, 1.6)
@@ -37,18 +30,17 @@ BLEND = 0.5
 def open_creases(posed: PosedBody, slot: float = SLOT) -> PosedBody:
     """The posed bodies with slots [m] in the creases of their elbows and knees; others as they were."""
     vertices = posed.mesh.vertices
-    for beyond, before, end in HINGES:
-        vertices = _pressed(
-            vertices, posed, [[JOINT_NAMES.index(n) for n in part] for part in (beyond, before, end)], slot
-        )
+    for side in "lr":
+        for names in HINGES:
+            vertices = _pressed(vertices, posed, [JOINT_NAMES.index(f"{side}_{name}") for name in names], slot)
     return replace(posed, mesh=posed.mesh.with_vertices(vertices))
 
 
-def _pressed(vertices: Tensor, posed: PosedBody, hinge: list[list[int]], slot: float) -> Tensor:
-    """(B, V, 3) skin on its own side of one bend."""
-    beyond, (before,), (end,) = hinge
+def _pressed(vertices: Tensor, posed: PosedBody, limb: list[int], slot: float) -> Tensor:
+    """(B, V, 3) skin on its own side of one bend, of joints as in ``HINGES``."""
+    before, *beyond = limb
     joint = posed.joints[:, beyond[0]]
-    up, down = (F.normalize(posed.joints[:, k] - joint, dim=-1) for k in (before, end))
+    up, down = (F.normalize(posed.joints[:, k] - joint, dim=-1) for k in (before, beyond[1]))
     across, inner = F.normalize(up - down, dim=-1), F.normalize(up + down, dim=-1)
     own, other = posed.weights[:, before], posed.weights[:, beyond].sum(1)
     side = torch.where(own > other, 1.0, -1.0) * (own + other > 0.5)

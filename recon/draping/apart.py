@@ -52,7 +52,7 @@ def draw_apart(
     skinning: Draper,
     say: Callable[[str], None] = lambda line: None,
 ) -> Apart:
-    """Drapes of one body, untangled; where anything is left, dressed by simulation and untangled from there.
+    """Drapes of one body, untangled; where anything is left, led along a simulation instead if less is left then.
 
     Args:
         garments: innermost first, at rest on the neutral body.
