@@ -28,7 +28,7 @@ class DatasetMake:
     """The set depends on this number alone (on one machine)."""
     tops: int = 400
     """Tank tops, T-shirts, shirts and jackets to train on."""
-    skirts: int = 300
+    skirts: int = 400
     """Skirts to train on."""
     trousers: int = 400
     """Trousers and shorts to train on."""

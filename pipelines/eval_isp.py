@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,6 +20,8 @@ RESOLUTION = 256
 """Grid at which decoded garments are compared."""
 FROM_MESH = 4
 """How many unseen garments are also found from their mesh: each takes a hundred decodings."""
+BESIDE = 0.003
+"""Border labels are asked for within this distance of the border [m]."""
 
 
 def evaluate(
@@ -64,11 +68,15 @@ def measure(decoder: IspDecoder, latent: Tensor, truth: Garment, generator: torc
 
 
 def label_accuracy(decoder: IspDecoder, latent: Tensor, truth: Garment, count: int = 1000) -> float:
-    """Share of the truth's border points whose label the pattern network finds."""
+    """Share of points within ``BESIDE`` of the truth's border, all of it alike, whose label the network finds."""
     rng, right = np.random.default_rng(0), []
+    shape = decoder.nets.shape
     for panel in range(decoder.panels):
-        border = panel_border(truth, decoder.nets.shape, panel)
-        at = along(border, rng, count)[0]
+        border = panel_border(truth, shape, panel)
+        even = replace(border, weight=np.linalg.norm(border.end - border.start, axis=1))
+        angle = 2 * np.pi * rng.random((count, 1))
+        aside = BESIDE / shape.half * rng.random((count, 1)) * np.concatenate([np.cos(angle), np.sin(angle)], 1)
+        at = along(even, rng, count)[0] + aside
         label = signed_distance(border, at)[1]
         _, logits = decoder.pattern(latent, decoder.nets.to_panel(torch.as_tensor(at, dtype=latent.dtype)))
         right.append((logits[:, panel].argmax(-1).numpy() == label).mean())

@@ -3,12 +3,13 @@
 The panels are graded to the person's shape, the garments put on in the T pose and carried into the photo's by
 simulation; then free vertices minimise StVK, bending, gravity and contact (DrapeNet Eq. 15) together with the labels'
 overlap, all layers at once. In between the panels are graded again, to the cloth as the photo shows it. Last, what
-passes through itself or another layer is drawn apart. Ends with no vertex and no face centre inside the body.
+passes through itself or another layer is drawn apart; where that fails layers are led, clean, from the T pose to their
+places. Ends with no vertex and no face centre inside the body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,7 +26,8 @@ from recon.cloth.energies import Cloth, Fabric
 from recon.cloth.layers import LayeredCloth
 from recon.cloth.solve import PolishSettings, lbfgs
 from recon.cloth.untangle import Untangling, untangle
-from recon.draping.dress import Dressing, dress, limits_of, neutral
+from recon.draping.apart import FINELY, followed
+from recon.draping.dress import Dressing, dress, dressed, limits_of, neutral
 from recon.garments.grading import grade
 from recon.losses import soft_iou_loss
 from recon.types import Camera, Garment, Mesh, Photo, PosedBody, to_device
@@ -59,6 +61,8 @@ class Refinement:
     """Distance from the body that every vertex and face centre ends with [m]."""
     untangling: int = 30
     """Most rounds of drawing apart what passes through itself or another layer; 0 = without."""
+    leading: int = 10
+    """Frames from where the garments were dressed to where they end, for layers that are led there instead."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +220,8 @@ def refine_with(
         posed = models.body.pose(to_body(values))
         layers = graded(layers, values, models)
     garments = [layer.garment for layer in layers]
-    parts = dress(garments, models.body, to_body(values), models.skinning, settings.dressing, tick)
+    pose = to_body(values)
+    parts = dress(garments, models.body, pose, models.skinning, settings.dressing, tick)
     device, faces = posed.mesh.vertices.device, [g.mesh.faces.to(posed.mesh.vertices.device) for g in garments]
     body = BodyContact(posed.mesh.vertices[0].cpu(), models.body.faces.cpu())
     evidence = evidence_of(posed, faces)
@@ -225,18 +230,37 @@ def refine_with(
         garments = [grade(g, torch.from_numpy(part)) for g, part in zip(garments, parts)]
         parts = match(parts, garments, body, evidence, settings, tick)
     layers = [replace(layer, garment=g) for layer, g in zip(layers, garments)]
-    meshes = drawn_apart(parts, [layer.garment.mesh.faces for layer in layers], body, settings)
+
+    def led() -> list[NDArray] | None:
+        way = dressed(garments, models.body, pose, models.skinning, replace(FINELY, creases=False))
+        return followed(way.then(parts, settings.leading), garments, models.body)
+
+    meshes = drawn_apart(parts, [g.mesh.faces for g in garments], body, settings, led)
     named = {layer.name: Mesh(m.vertices.to(device), f) for layer, m, f in zip(layers, meshes, faces)}
     return Refined([to_device(layer, device) for layer in layers], named)
 
 
-def drawn_apart(parts: list[NDArray], faces: list[Tensor], body: BodyContact, settings: Refinement) -> list[Mesh]:
-    """The layers (V, 3) out of the body, and out of each other as far as there is room; on the CPU."""
+def drawn_apart(
+    parts: list[NDArray],
+    faces: list[Tensor],
+    body: BodyContact,
+    settings: Refinement,
+    led: Callable[[], list[NDArray] | None],
+) -> list[Mesh]:
+    """The layers (V, 3) out of the body, and out of each other as far as there is room; on the CPU.
 
-    def out(x: NDArray, f: Tensor) -> Mesh:
-        return Mesh(push_out(torch.from_numpy(x).float(), f, body, settings.margin), f)
+    ``led``: the same layers, come to their places without crossing anything, if they can; asked where untangling fails.
+    """
+    worn, how = Mesh(body.vertices, body.faces), Untangling(rounds=settings.untangling, body=settings.margin)
 
-    meshes = [out(x, f) for x, f in zip(parts, faces)]
-    how = Untangling(rounds=settings.untangling, body=settings.margin)
-    done = untangle(meshes, Mesh(body.vertices, body.faces), how)
-    return [out(x, f) for x, f in zip(done.vertices, faces)]
+    def out(layers: Sequence[NDArray]) -> list[Mesh]:
+        xs = [torch.from_numpy(x).float() for x in layers]
+        return [Mesh(push_out(x, f, body, settings.margin), f) for x, f in zip(xs, faces)]
+
+    def crossing(meshes: list[Mesh]) -> int:
+        return len(untangle(meshes, worn, replace(how, rounds=0, tries=1)).left)
+
+    meshes = out(untangle(out(parts), worn, how).vertices)
+    if settings.untangling and crossing(meshes) and (way := led()) is not None:
+        meshes = min(meshes, out(untangle(out(way), worn, how).vertices), key=crossing)
+    return meshes

@@ -1,14 +1,14 @@
 """Cloth that follows a simulated motion and crosses nothing on the way.
 
 A simulation that knows distances but no crossings ends where a sleeve was pressed through itself in a bent elbow, and
-from there no small moves lead out. Here cloth starts clean and goes as the simulation went, frame by frame: what a
-frame's move would make cross is cut short, then drawn to where the simulation has it as far as that crosses nothing.
-So crossings never are; what the body's parts pinch between them may end inside the body.
+from there no small moves lead out. Here cloth starts clean and goes along with the body, frame by frame: what a frame's
+move would make cross is cut short, then drawn to where the simulation has it as far as that crosses nothing. So
+crossings never are; what the body's parts pinch between them may end inside the body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,7 @@ AROUND = 3
 class Following:
     """How cloth catches up with the simulation."""
 
-    rounds: int = 3
+    rounds: int = 1
     """Steps after each frame's move."""
     last: int = 20
     """Steps after the last."""
@@ -52,12 +52,19 @@ class Following:
     """Distance kept from the body [m]."""
     leaving: int = 60
     """Most steps that only lead out of the body, wherever the simulation has cloth."""
+    patience: int = 10
+    """These end after so many that lead nothing out."""
     barely: float = 1e-4
     """Distance from the body that these ask for: where its parts pinch cloth there is no room for more [m]."""
 
 
 def follow(
-    layers: Sequence[Mesh], goals: NDArray, bodies: NDArray, faces: Tensor, settings: Following | None = None
+    layers: Sequence[Mesh],
+    goals: NDArray,
+    bodies: NDArray,
+    faces: Tensor,
+    space: Callable[[int, NDArray], NDArray],
+    settings: Following | None = None,
 ) -> list[NDArray]:
     """Where layers get that cross nothing on the way.
 
@@ -66,6 +73,8 @@ def follow(
         goals: (T, V, 3) where a simulation has all of them, from the start on [m].
         bodies: (T, B, 3) what they are worn on [m].
         faces: (F, 3) of those, outward.
+        space: takes a frame's number and cloth (V, 3) beside the body of the one before, and says where the body takes
+            it: all of it alike, so that little of it passes through anything.
         settings: see :class:`Following`.
 
     Returns:
@@ -74,7 +83,7 @@ def follow(
     stack, way = Stack.of(layers), _Way(layers, settings or Following())
     x = stack.x
     for k in range(1, len(goals)):
-        x = way.frame(x, goals[k - 1 : k + 1], Mesh(torch.from_numpy(bodies[k]), faces), k + 1 == len(goals))
+        x = way.frame(x, space(k, x) - x, goals[k], Mesh(torch.from_numpy(bodies[k]), faces), k + 1 == len(goals))
     return stack.split(way.out(x))
 
 
@@ -88,21 +97,21 @@ class _Way:
         self.repairs = Repairs(crossings, stack.starts, settings.gap, scale)
         self.tighten = Tighten(self.repairs, None, settings.margin)
 
-    def frame(self, x: NDArray, goals: NDArray, body: Mesh, last: bool) -> NDArray:
-        """From ``x`` (V, 3) on as from the first of ``goals`` (2, V, 3) to the second."""
+    def frame(self, x: NDArray, step: NDArray, goal: NDArray, body: Mesh, last: bool) -> NDArray:
+        """From ``x`` (V, 3) by ``step`` (V, 3), then towards ``goal`` (V, 3)."""
         self._wear(body, x)
-        x = self.tighten.filtered(x, goals[1] - goals[0], False)
-        return self._catch_up(x, goals[1], self.settings.last if last else self.settings.rounds)
+        x = self.tighten.filtered(x, step, False)
+        return self._catch_up(x, goal, self.settings.last if last else self.settings.rounds)
 
     def out(self, x: NDArray) -> NDArray:
         """Of steps from ``x`` (V, 3) that only lead out of the body, crossing nothing, the end with least inside."""
         self.tighten.margin = self.settings.barely
-        best, least = x, np.inf
+        best, least, when = x, np.inf, 0
         for number in range(self.settings.leaving + 1):
             lack = self._lack(x)
             if lack.sum() < least:
-                best, least = x, lack.sum()
-            if not least:
+                best, least, when = x, lack.sum(), number
+            if not least or number - when > self.settings.patience:
                 break
             step = self.tighten.apart(x.copy(), self._around(self._vertices(lack)), number) - x
             x = self.tighten.filtered(x, step, False)

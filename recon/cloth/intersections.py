@@ -1,7 +1,8 @@
 """Where edges pass through faces: the exact test behind self-intersections and untangling, compiled.
 
-A box hierarchy (Warp) proposes, signs of tetrahedron volumes in doubles decide: no division, so no tolerance. Edges
-that share a vertex with a face are not tested against it.
+A box hierarchy (Warp) proposes, signs of tetrahedron volumes in doubles decide: no division, so no tolerance, but for
+edges in the plane of a face up to rounding, where signs say nothing: these don't count. Edges that share a vertex with
+a face are not tested against it.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ wp.set_module_options({"enable_backward": False})
 DEVICE = "cpu"
 GROW = 1.0e-6
 """Boxes are grown by this share of their coordinates: they are single precision, the test is not."""
+ROUNDING = wp.constant(wp.float64(1e-12))
+"""A point this much nearer to a face's plane than the face is long lies in it."""
 
 
 @wp.func
@@ -29,7 +32,13 @@ def _through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     zero = wp.float64(0.0)
     above = _volume(a, b, c, p)
     below = _volume(a, b, c, q)
-    if (above > zero and below > zero) or (above < zero and below < zero) or (above == zero and below == zero):
+    if (above > zero and below > zero) or (above < zero and below < zero):
+        return False
+    flat = ROUNDING * wp.length_sq(b - a) * wp.length_sq(c - a)
+    if (
+        above * above <= flat * wp.length_sq(p - a) * ROUNDING
+        and below * below <= flat * wp.length_sq(q - a) * ROUNDING
+    ):
         return False
     u = _volume(p, q, a, b)
     v = _volume(p, q, b, c)

@@ -20,12 +20,19 @@ from recon.bodies.creases import open_creases
 from recon.cloth.follow import follow
 from recon.cloth.untangle import Untangled, Untangling, untangle
 from recon.draping import Draper
-from recon.draping.dress import Dressing, dressed
+from recon.draping.dress import Dressed, Dressing, begun, dress, dressed
+from recon.draping.nest import Shells
+from recon.draping.space import Space
 from recon.types import BodyPose, Garment, Mesh, PosedBody
 
 TRIES = 2
 """Ways in which drapes are untangled: what two leave tangled the others mostly do, too, and they cost more than a
 simulation."""
+
+DRAWING_IN = 20
+"""Frames in which layers that were put around each other are drawn in."""
+FINELY = Dressing(frames=120, steps=7, creases=True)
+"""How layers are carried that follow: the smaller a step, the less of it makes anything cross."""
 
 
 @dataclass(frozen=True)
@@ -85,14 +92,47 @@ def _worth(done: Untangled) -> tuple[int, int]:
 
 def _simulated(garments: Sequence[Garment], body: Body, pose: BodyPose, skinning: Draper) -> list[NDArray]:
     """(V, 3) of each garment, outermost first: free of crossings if they are in the T pose, else as simulated."""
-    way = dressed(garments, body, pose, skinning, Dressing(creases=True))
-    faces = [g.mesh.faces.cpu() for g in garments]
-    begin = [Mesh(torch.from_numpy(x[0]), f) for x, f in zip(way.garments, faces)]
-    start = untangle(begin, Mesh(torch.from_numpy(way.bodies[0]), body.faces))
-    if len(start.left):
-        return [x[-1] for x in way.garments]
-    clean = [mesh.with_vertices(torch.from_numpy(x)) for mesh, x in zip(begin, start.vertices)]
-    return follow(clean, np.concatenate(way.garments, 1), way.bodies, body.faces.cpu())
+    way = dressed(garments, body, pose, skinning, FINELY)
+    ends = followed(way, garments, body)
+    if ends is None and len(garments) > 1:
+        ends = followed(way.later(DRAWING_IN), garments, body, _nested(garments, way, body, pose, skinning))
+    return ends or [x[-1] for x in way.garments]
+
+
+def _nested(garments: Sequence[Garment], way: Dressed, body: Body, pose: BodyPose, skinning: Draper) -> list[NDArray]:
+    """(V, 3) of each garment, outermost first, around each other on the body in the T pose."""
+    around, shells = list[NDArray](), Shells(Mesh(torch.from_numpy(way.bodies[0]), body.faces))
+    for garment in reversed(garments):
+        (hung,) = dress([garment], body, begun(pose), skinning, Dressing(frames=1))
+        around.append(shells.around(hung, around))
+    return around[::-1]
+
+
+def followed(
+    way: Dressed,
+    garments: Sequence[Garment],
+    body: Body,
+    start: Sequence[NDArray] | None = None,
+) -> list[NDArray] | None:
+    """Where layers get that cross nothing on the way of a simulation; None where they do in the T pose already.
+
+    Args:
+        way: as the garments were simulated, the first frame in the T pose, the steps as fine as ``FINELY``.
+        garments: outermost first.
+        body: the body model.
+        start: (V, 3) where each begins in the T pose; as in the simulation if not given [m].
+
+    Returns:
+        (V, 3) of each garment [m].
+    """
+    begin, faces = start or [x[0] for x in way.garments], body.faces.cpu()
+    layers = [Mesh(torch.from_numpy(x), g.mesh.faces.cpu()) for x, g in zip(begin, garments, strict=True)]
+    apart = untangle(layers, Mesh(torch.from_numpy(way.bodies[0]), faces))
+    if len(apart.left):
+        return None
+    clean = [mesh.with_vertices(torch.from_numpy(x)) for mesh, x in zip(layers, apart.vertices)]
+    goals, space = np.concatenate(way.garments, 1), Space(body, way.bodies[0], way.transforms)
+    return follow(clean, goals, way.bodies, faces, space)
 
 
 def _ended(layers: Sequence[Mesh], posed: PosedBody, done: Untangled, first: Untangled, dressed: bool) -> Apart:

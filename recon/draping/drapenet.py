@@ -41,6 +41,8 @@ NODE_WIDTH = 0.0125
 """Distance of the nodes at which a fine mesh asks the networks [m]: draped vertices are 0.3 mm off in the mean."""
 MANY = 20_000
 """Meshes of more vertices than this may be finer than the nodes."""
+ROUNDS = 48
+"""Rounds that end a drape: with these strain is a tenth of skinning's, with half of them a seventh."""
 FEW = 8
 """Up to so many bodies a garment is draped at once, and not made ready first."""
 
@@ -297,7 +299,7 @@ class DrapeNetDraper:
         asked = mesh.vertices.requires_grad and torch.is_grad_enabled()
         if last and not asked and last[0].vertices is mesh.vertices and last[0].faces is mesh.faces:
             return last[1]
-        ending = Ending.of(garment, self.skinning.surface)
+        ending = Ending.of(garment, self.skinning.surface, ROUNDS)
         found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), ending=ending)
         if not asked:
             self._last = mesh, found

@@ -71,6 +71,21 @@ class Dressed:
     """(T, V, 3) of each, outermost first, double precision [m]."""
     bodies: NDArray
     """(T, B, 3) [m]."""
+    transforms: NDArray
+    """(T, 24, 4, 4) of its joints, as in ``PosedBody``."""
+
+    def then(self, ends: Sequence[NDArray], frames: int) -> Dressed:
+        """Further on to (V, 3) of each garment by frames of equal steps, while the body stays."""
+        share = np.linspace(0, 1, frames + 1)[1:, None, None]
+        way = [np.concatenate([x, x[-1] + share * (end - x[-1])]) for x, end in zip(self.garments, ends, strict=True)]
+        still = (np.concatenate([part, np.repeat(part[-1:], frames, 0)]) for part in (self.bodies, self.transforms))
+        return Dressed(way, *still)
+
+    def later(self, frames: int) -> Dressed:
+        """The same after so many frames in which nothing moves."""
+        parts = [*self.garments, self.bodies, self.transforms]
+        *way, bodies, transforms = (np.concatenate([np.repeat(part[:1], frames, 0), part]) for part in parts)
+        return Dressed(way, bodies, transforms)
 
 
 def dress(
@@ -105,7 +120,7 @@ def dressed(
         tick: hears (frame, 0) after each frame of each garment.
     """
     s = settings or Dressing()
-    posed, device = body.pose(_way(pose, s.frames)), pose.pose.device
+    posed, device = body.pose(way_to(pose, s.frames)), pose.pose.device
     posed = open_creases(posed) if s.creases else posed
     frames, faces = posed.mesh.vertices.cpu().numpy(), body.faces.cpu().numpy()
     simulation = Settings(
@@ -123,7 +138,7 @@ def dressed(
         # What lies beneath is part of what the next garment collides with.
         faces = np.concatenate([faces, garment.mesh.faces.cpu().numpy() + frames.shape[1]])
         frames = np.concatenate([frames, worn[-1].astype(np.float32)], 1)
-    return Dressed(worn[::-1], skin)
+    return Dressed(worn[::-1], skin, posed.transforms.cpu().double().numpy())
 
 
 def neutral(pose: BodyPose) -> BodyPose:
@@ -131,7 +146,12 @@ def neutral(pose: BodyPose) -> BodyPose:
     return replace(pose, pose=torch.zeros_like(pose.pose))
 
 
-def _way(pose: BodyPose, count: int) -> BodyPose:
+def begun(pose: BodyPose) -> BodyPose:
+    """The same body in the T pose, turned and placed as it is: where the way of :func:`dressed` begins."""
+    return BodyPose(*(part[:1] for part in vars(way_to(pose, 1)).values()))
+
+
+def way_to(pose: BodyPose, count: int) -> BodyPose:
     """(count + 1) bodies from T (turned and placed as in the end) to the pose."""
     share = torch.linspace(0, 1, count + 1, dtype=pose.pose.dtype, device=pose.pose.device)
     joints = pose.pose * share[:, None, None]

@@ -110,3 +110,10 @@ def test_what_moved_is_enough_to_ask() -> None:
     rough = v + moved[:, None] * np.array([2.5, 1.3, 0.05])
     assert len(test(rough)) and np.array_equal(test(rough, moved), test(rough))
     assert not len(test(rough, np.zeros(len(v), bool)))
+
+
+def test_a_plane_that_is_turned_does_not_cross_itself_by_rounding() -> None:
+    v, f = grid(0, 0.0)
+    for seed in range(10):
+        turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+        assert not len(self_intersections(0.02 * v @ turn + 0.3, f))
