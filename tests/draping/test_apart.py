@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from recon.bodies import load_body
+from recon.cloth.beneath import Beneath, vertex_normals
+from recon.cloth.intersections import Crossings
+from recon.cloth.stack import Stack
 from recon.cloth.untangle import untangle
 from recon.draping import apart
+from recon.draping.dress import Dressing
 from recon.draping.skinning import SkinningDraper
 from recon.garments import load_decoder
 from recon.types import Mesh
@@ -63,3 +67,36 @@ def test_a_simulation_that_ends_no_better_is_not_taken(worn, monkeypatch) -> Non
     monkeypatch.setattr(apart, "untangle", lambda *a: tangled)
     found = apart.draw_apart([skirt.mesh], [drape], body, pose, skinning)
     assert not found.dressed and len(found.done.left) == 3
+
+
+@pytest.fixture(scope="module")
+def narrow_over_wide(worn):
+    """A tank top over a wide jacket, coarse."""
+    decoder = load_decoder("top")
+    width = [p["waist_x"] for p in decoder.parameters]
+    kinds = np.array(decoder.variants)
+    wide = max(np.flatnonzero(kinds == "jacket"), key=lambda k: width[k])
+    narrow = min(np.flatnonzero(kinds == "tank"), key=lambda k: width[k])
+    with torch.no_grad():
+        return [decoder.decode(decoder.codes[k], 32) for k in (narrow, wide)]
+
+
+def test_what_is_tangled_in_the_t_pose_begins_around_what_is_beneath(worn, narrow_over_wide, monkeypatch) -> None:
+    body, pose, skinning, *_ = worn
+    starts, follow = list[object](), apart.followed
+
+    def stubborn(way, garments, body, start=None):
+        starts.append(start)
+        return None if start is None else follow(way, garments, body, start)
+
+    monkeypatch.setattr(apart, "followed", stubborn)
+    monkeypatch.setattr(apart, "FINELY", Dressing(frames=12, steps=5, creases=True))
+    monkeypatch.setattr(apart, "DRAWING_IN", 8)
+    ends = apart._simulated(narrow_over_wide, body, pose, skinning)
+    assert starts[0] is None and starts[1] is not None and len(starts) == 2
+    meshes = [Mesh(torch.from_numpy(x), g.mesh.faces) for x, g in zip(ends, narrow_over_wide, strict=True)]
+    stack = Stack.of(meshes)
+    assert not len(Crossings(stack.faces, len(stack.x))(stack.x))
+    over, under = meshes
+    lack, _ = Beneath.of(under.vertices, under.faces).lack(over.vertices, vertex_normals(*vars(over).values()), 0.0)
+    assert float((lack > 1e-3).double().mean()) < 0.02
