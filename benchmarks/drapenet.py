@@ -41,7 +41,7 @@ from recon.bodies import Body, load_body
 from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, bending, gravity, stvk
-from recon.draping.drapenet import DrapeNetDraper, DrapeNets, Known, load_drapenet
+from recon.draping.drapenet import ROUNDS, DrapeNetDraper, DrapeNets, Known, load_drapenet
 from recon.draping.dress import dress
 from recon.draping.ending import Ending
 from recon.draping.layering import settled
@@ -180,7 +180,7 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
         x = garment.mesh.vertices[pick] + 1e-3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
         mesh = Mesh(x, tube(count // 50, 50).faces)
         made = draper.nets.prepare(mesh, "top", code=code)
-        ending = Ending.of(Garment.bare("", mesh), draper.skinning.surface)
+        ending = Ending.of(Garment.bare("", mesh), draper.skinning.surface, ROUNDS)
         known = Known(None, code, ending=ending)
 
         def anew(mesh=mesh, known=known) -> torch.Tensor:
@@ -195,7 +195,7 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
 
     def bound() -> Known:
         bound, code = draper.nets.bound(garment.mesh, draper.skinning), draper.nets.code(garment.mesh)
-        return Known(bound, code, ending=Ending.of(garment, draper.skinning.surface))
+        return Known(bound, code, ending=Ending.of(garment, draper.skinning.surface, ROUNDS))
 
     found["bind_ms"] = _timed(bound, size.repeats)
     return found
@@ -276,8 +276,10 @@ def run(size: Size, weights: Path | None, quick: bool) -> dict:
     parts = read_manifest(weights)["drapenet"]["parts"]
     with torch.enable_grad():
         decoder = decoder_figures(quick)
+        beside = importlib.import_module("decoders").measure() if decoder and not quick else []
     return {
         **decoder,
+        "decoders": beside,
         "b2g_pct": {g: t["drapenet"]["b2g_pct"] for g, t in draped["cleared"].items()},
         "g2g_pct": {way: found["g2g_pct"] for way, found in over["cleared"].items()},
         "strain_ratio": dict(zip(GROUPS, ratio["cleared"], strict=True)),
@@ -328,7 +330,16 @@ def page(found: dict) -> str:
         f"{found['bind_ms']} ms. Off the networks asked in full: {found['drape_off_mm']} mm in the mean. "
         f"Threads: {found['threads']}; load of the machine before: {found['load']} (two cores; above 2 it is too slow)."
     )
+    if found.get("decoders"):
+        lines += ["", "## Against ISP's decoder (ISP's Tables 1-3)", "", *side_by_side(found["decoders"])]
     return "\n".join(lines) + "\n"
+
+
+def side_by_side(means: list[dict]) -> list[str]:
+    """Both decoders' figures, by the benchmark that makes them."""
+    module = importlib.import_module("decoders")
+    told = (module.__doc__ or "").partition("\n\n")[2].strip()
+    return [told, "", *module.table(means), "", "Paper: ISP's CHD is .795 of UDF's."]
 
 
 def main() -> None:

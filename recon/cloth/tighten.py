@@ -101,12 +101,15 @@ class Tighten:
     def filtered(self, x: NDArray, step: NDArray, outside: bool = True) -> NDArray:
         """``x`` (V, 3) moved by as much of ``step`` (V, 3) as makes nothing cross; ``x`` itself must be clean.
 
+        Places are those that single precision has: meshes are kept in it, and what nearly touches may cross by rounding.
+
         ``outside``: nothing may enter the body either, and nothing of ``x`` is in it.
         """
         share = np.ones(len(x))
-        changed = np.abs(step).max(1) > 0
+        changed = np.ones(len(x), bool)
         for trial in range(TRIALS):
-            after = x + share[:, None] * step
+            after = (x + share[:, None] * step).astype(np.float32).astype(np.float64)
+            changed &= (after != x).any(1) | (trial > 0)
             wrong = self._offenders(after, changed, outside)
             if not wrong.any():
                 return after

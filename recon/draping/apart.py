@@ -33,6 +33,8 @@ DRAWING_IN = 20
 """Frames in which layers that were put around each other are drawn in."""
 FINELY = Dressing(frames=120, steps=7, creases=True)
 """How layers are carried that follow: the smaller a step, the less of it makes anything cross."""
+THERE = 1e-3
+"""Cloth this near to where a simulation has it goes as it does [m]; other cloth goes with the body."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def draw_apart(
     ends = _simulated([Garment.of(g) for g in reversed(garments)], body, pose, skinning)
     again = [mesh.with_vertices(torch.from_numpy(x).to(mesh.vertices)) for mesh, x in zip(drapes, ends[::-1])]
     plain = untangle(again[::-1], worn, Untangling(tries=1, rounds=0))
-    tried = plain if plain.clean else untangle(again[::-1], worn, Untangling(tries=TRIES))
+    # What only lies in the body was led out as far as nothing crosses.
+    tried = untangle(again[::-1], worn, Untangling(tries=TRIES)) if len(plain.left) else plain
     second = min(plain, tried, key=_worth)
     if _worth(second) < _worth(first):
         return _ended(again, posed, second, first, True)
@@ -127,12 +130,17 @@ def followed(
     """
     begin, faces = start or [x[0] for x in way.garments], body.faces.cpu()
     layers = [Mesh(torch.from_numpy(x), g.mesh.faces.cpu()) for x, g in zip(begin, garments, strict=True)]
-    apart = untangle(layers, Mesh(torch.from_numpy(way.bodies[0]), faces))
+    apart = untangle(layers, Mesh(torch.from_numpy(way.bodies[0]), faces), Untangling(tries=TRIES))
     if len(apart.left):
         return None
     clean = [mesh.with_vertices(torch.from_numpy(x)) for mesh, x in zip(layers, apart.vertices)]
     goals, space = np.concatenate(way.garments, 1), Space(body, way.bodies[0], way.transforms)
-    return follow(clean, goals, way.bodies, faces, space)
+
+    def along(k: int, x: NDArray) -> NDArray:
+        there = np.linalg.norm(x - goals[k - 1], axis=1, keepdims=True) < THERE
+        return np.where(there, x + goals[k] - goals[k - 1], space(k, x))
+
+    return follow(clean, goals, way.bodies, faces, along)
 
 
 def _ended(layers: Sequence[Mesh], posed: PosedBody, done: Untangled, first: Untangled, dressed: bool) -> Apart:

@@ -45,7 +45,7 @@ def test_a_clean_motion_is_followed_exactly() -> None:
     x = cloth.vertices.numpy()
     goals = np.stack([x + [0.01 * k, 0.01 * k, 0] for k in range(5)])
     (end,) = follow([cloth], goals, bodies(5), FACES, towards(goals))
-    assert np.abs(end - goals[-1]).max() < 1e-12
+    assert np.abs(end - goals[-1]).max() < 1e-7
 
 
 def test_a_layer_that_a_simulation_tilts_through_another_stays_above_it() -> None:
