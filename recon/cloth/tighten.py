@@ -101,7 +101,7 @@ class Tighten:
     def filtered(self, x: NDArray, step: NDArray, outside: bool = True) -> NDArray:
         """``x`` (V, 3) moved by as much of ``step`` (V, 3) as makes nothing cross; ``x`` itself must be clean.
 
-        Places are those that single precision has: meshes are kept in it, and what nearly touches may cross by rounding.
+        Places are those that single precision has: meshes are kept in it, and what all but touches may cross by then.
 
         ``outside``: nothing may enter the body either, and nothing of ``x`` is in it.
         """
