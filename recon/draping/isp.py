@@ -27,15 +27,11 @@ from recon.draping.gaps import Bound
 from recon.draping.skinning import SkinningDraper
 from recon.draping.uv import Box, Cosines, Welding, around, map_size, modes, rest_features
 from recon.files.weights import read_weights
-from recon.garments import WAISTED
 from recon.types import Garment, Mesh, PosedBody, UserError
 
 FARTHEST = 1.0
 """Garments further from the learned ones' mean than so many deviations (root mean square of the components) count as if
 they were there: beyond, the network guesses (a wide jacket strained to six times skinning's)."""
-FEW_ROUNDS = 16
-"""Rounds that end a drape from the waist, whose network leaves less to them: with half as many more strain falls from
-.083 to .059 of skinning's (trousers), and 13,400 vertices take more than 10 ms."""
 KEPT = 4
 """So many garments stay prepared."""
 
@@ -148,10 +144,8 @@ class Worn:
     ending: Ending
 
     @classmethod
-    def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper, rounds: int | None = None) -> Worn:
+    def of(cls, garment: Garment, net: DisplacementNet, skinning: SkinningDraper, rounds: int = ROUNDS) -> Worn:
         """Bind, read the rest maps, find the panel points' places on the displacement maps; ``rounds`` end a drape."""
-        if rounds is None:
-            rounds = FEW_ROUNDS if garment.kind in WAISTED else ROUNDS
         box = net.shape.box
         rows, shares = around(box, map_size(box), garment.panel_points.to(net.mean), garment.side_of_point)
         weights, directions = skinning.bind(garment.mesh.vertices, garment.mesh.faces)

@@ -96,7 +96,7 @@ def test_without_displacement_it_is_skinning(body, skirt) -> None:
 
 def test_the_last_rounds_take_strain_away(body, skirt) -> None:
     draper, at, cloth = draper_of(body), posed(body), Cloth.from_garment(skirt)
-    assert (stvk(cloth, draper.drape(skirt, at).vertices) < 0.5 * stvk(cloth, raw(draper, skirt, at))).all()
+    assert (stvk(cloth, draper.drape(skirt, at).vertices) < 0.4 * stvk(cloth, raw(draper, skirt, at))).all()
 
 
 def test_a_batch_is_its_bodies_one_by_one(body, skirt) -> None:
