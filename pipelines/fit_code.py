@@ -30,6 +30,8 @@ FARTHEST = 3.5
 """No coordinate of a code is sought further from the mean than this [standard deviations]."""
 TRUST = 0.5
 """Nor further than this in one round: borders follow a code only so far before the garment must be cut anew."""
+FIRST_STEP = 0.3
+"""Length of a round's first step where a shorter one changed nothing [standard deviations]."""
 DIFFERENCE = 0.02
 """Step of the finite differences that tell stretch [domain units]."""
 
@@ -167,7 +169,10 @@ def _round(decoder: IspDecoder, evidence: Evidence, latent: Tensor, settings: Co
     except UserError:
         return latent, HOPELESS
 
+    best, least = latent, HOPELESS
+
     def energy(white: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal best, least
         w = torch.as_tensor(white, dtype=latent.dtype).requires_grad_()
         z = prior.mean + prior.factor @ w
         try:
@@ -177,6 +182,8 @@ def _round(decoder: IspDecoder, evidence: Evidence, latent: Tensor, settings: Co
         if not bool(value.isfinite()):
             return HOPELESS, np.zeros_like(white)
         (gradient,) = torch.autograd.grad(value, w)
+        if float(value.detach()) < least:
+            best, least = z.detach(), float(value.detach())
         return float(value.detach()), gradient.double().numpy()
 
     away = (latent - prior.mean)[:, None]
@@ -185,4 +192,13 @@ def _round(decoder: IspDecoder, evidence: Evidence, latent: Tensor, settings: Co
         bounds = [(max(w - TRUST, min(w, -FARTHEST)), min(w + TRUST, max(w, FARTHEST))) for w in white]
         options = {"maxiter": settings.steps, "maxfun": round(1.3 * settings.steps), "maxcor": 20, "maxls": 8}
         found = minimize(energy, white, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return (prior.mean + prior.factor @ torch.as_tensor(found.x, dtype=latent.dtype)).detach(), float(found.fun)
+        size = float(np.linalg.norm(found.jac))
+        if not found.nit and size:  # a first step as long as the gradient ends on a silhouette's plateau
+            scale = FIRST_STEP / size
+
+            def scaled(white: np.ndarray) -> tuple[float, np.ndarray]:
+                value, gradient = energy(white)
+                return scale * value, scale * gradient
+
+            minimize(scaled, white, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return best, least

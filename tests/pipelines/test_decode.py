@@ -46,7 +46,7 @@ def test_codes_by_name():
     [
         (("top",), "a.obj", 64, "wanted KIND CODE"),
         (("hat", "mean"), "a.obj", 64, "found 'hat'"),
-        (("skirt", "5000"), "a.obj", 64, "a number from 0 to 299"),
+        (("skirt", "5000"), "a.obj", 64, "a number from 0 to 399"),
         (("skirt", "median"), "a.obj", 64, "found 'median'"),
         (("skirt", "mean"), "a.stl", 64, "wanted one of .obj"),
         (("skirt", "mean"), "a.obj", 4, "resolution: found 4"),
