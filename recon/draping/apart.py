@@ -137,6 +137,8 @@ def followed(
     goals, space = np.concatenate(way.garments, 1), Space(body, way.bodies[0], way.transforms)
 
     def along(k: int, x: NDArray) -> NDArray:
+        if start is not None:  # the simulation's layers pass through each other: its moves would part them
+            return space(k, x)
         there = np.linalg.norm(x - goals[k - 1], axis=1, keepdims=True) < THERE
         return np.where(there, x + goals[k] - goals[k - 1], space(k, x))
 
