@@ -23,8 +23,10 @@ from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models, photo_size, scene_images
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, Fabric
+from recon.cloth.intersections import Crossings
 from recon.cloth.layers import LayeredCloth
 from recon.cloth.solve import PolishSettings, lbfgs
+from recon.cloth.stack import Stack
 from recon.cloth.untangle import Untangling, untangle
 from recon.draping.apart import FINELY, followed
 from recon.draping.dress import Dressing, dress, dressed, limits_of, neutral
@@ -258,7 +260,8 @@ def drawn_apart(
         return [Mesh(push_out(x, f, body, settings.margin), f) for x, f in zip(xs, faces)]
 
     def crossing(meshes: list[Mesh]) -> int:
-        return len(untangle(meshes, worn, replace(how, rounds=0, tries=1)).left)
+        stack = Stack.of(meshes)
+        return len(Crossings(stack.faces, len(stack.x))(stack.x))
 
     meshes = out(untangle(out(parts), worn, how).vertices)
     if settings.untangling and crossing(meshes) and (way := led()) is not None:

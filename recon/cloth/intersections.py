@@ -34,11 +34,8 @@ def _through(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d):
     below = _volume(a, b, c, q)
     if (above > zero and below > zero) or (above < zero and below < zero):
         return False
-    flat = ROUNDING * wp.length_sq(b - a) * wp.length_sq(c - a)
-    if (
-        above * above <= flat * wp.length_sq(p - a) * ROUNDING
-        and below * below <= flat * wp.length_sq(q - a) * ROUNDING
-    ):
+    plane = ROUNDING * wp.length(b - a) * wp.length(c - a)
+    if wp.abs(above) <= plane * wp.length(p - a) and wp.abs(below) <= plane * wp.length(q - a):
         return False
     u = _volume(p, q, a, b)
     v = _volume(p, q, b, c)

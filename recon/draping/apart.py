@@ -2,7 +2,8 @@
 
 Networks drape each garment by itself, whatever it would have to pass through: a sleeve that they fold into a bent elbow
 may leave no way out. Then a simulation starts in the T pose, where layers lie clean over each other, and carries them
-into the pose; they follow it as far as nothing crosses (``follow``). The body that they end on has room in its creases
+into the pose; they follow it as far as nothing crosses (``follow``). Where they don't lie clean there either they begin
+in shells around each other (``nest``). The body that they end on has room in its creases
 (``open_creases``): where its parts pass through each other no cloth can be outside of both.
 """
 
@@ -34,7 +35,7 @@ DRAWING_IN = 20
 FINELY = Dressing(frames=120, steps=7, creases=True)
 """How layers are carried that follow: the smaller a step, the less of it makes anything cross."""
 THERE = 1e-3
-"""Cloth this near to where a simulation has it goes as it does [m]; other cloth goes with the body."""
+"""Cloth this near to where a simulation has it moves as it does [m]; other cloth goes with the body."""
 
 
 @dataclass(frozen=True)
@@ -136,13 +137,12 @@ def followed(
     clean = [mesh.with_vertices(torch.from_numpy(x)) for mesh, x in zip(layers, apart.vertices)]
     goals, space = np.concatenate(way.garments, 1), Space(body, way.bodies[0], way.transforms)
 
-    def along(k: int, x: NDArray) -> NDArray:
-        if start is not None:  # the simulation's layers pass through each other: its moves would part them
-            return space(k, x)
+    def as_simulated(k: int, x: NDArray) -> NDArray:
         there = np.linalg.norm(x - goals[k - 1], axis=1, keepdims=True) < THERE
         return np.where(there, x + goals[k] - goals[k - 1], space(k, x))
 
-    return follow(clean, goals, way.bodies, faces, along)
+    # A simulation that is tangled from the T pose on moves layers through each other: then all go with the body.
+    return follow(clean, goals, way.bodies, faces, as_simulated if start is None else space)
 
 
 def _ended(layers: Sequence[Mesh], posed: PosedBody, done: Untangled, first: Untangled, dressed: bool) -> Apart:

@@ -1,10 +1,10 @@
-"""A garment put around all that is worn beneath it: the start of a simulation of layers.
+"""A garment put around all that is worn beneath it: where layers begin that are then led into a pose.
 
 Where a narrow shirt goes over a wide jacket, where it would hang alone does not say how it could be around the jacket,
 and a simulation that begins there presses one through the other. Here space itself is drawn outward: cloth moves along
 the gradient of a soft distance from the body until all of it lies in a shell around what is beneath, cloth that is
 further out still further out. Such a motion takes no two points to one place, so what hung clean stays clean up to its
-facets. Cloth is stretched by it, up to several times at the arms: it is where a simulation begins, and no drape.
+facets. Cloth is stretched by it, up to several times at the arms: it is a beginning (``follow``), and no drape.
 """
 
 from __future__ import annotations

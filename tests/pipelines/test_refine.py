@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ import torch
 from pipelines.evidence import level
 from pipelines.fit_body import to_body, to_camera
 from pipelines.fit_garment import Layer, Models
-from pipelines.refine import Refined, Refinement, Silhouettes, push_out, refine
+from pipelines.refine import Refined, Refinement, Silhouettes, drawn_apart, push_out, refine
 from recon.bodies import load_body
 from recon.cloth.contact import BodyContact
 from recon.draping.dress import Dressing
@@ -114,3 +114,29 @@ def test_push_out_ends_with_the_margin_and_moves_nothing_else(layers) -> None:
     far[mesh.faces[dented[mesh.faces].any(1)].unique()] = False
     assert far.any() and torch.equal(out[far], x[far])
     assert torch.equal(push_out(out, mesh.faces, contact, QUICK.margin), out)
+
+
+def test_layers_that_stay_tangled_are_led_to_their_places(values, layers, refined: Refined, monkeypatch) -> None:
+    contact = BodyContact(BODY.pose(to_body(values)).mesh.vertices[0], BODY.faces)
+    faces = [layer.garment.mesh.faces for layer in layers]
+    good = [refined.meshes[layer.name].vertices.double().numpy() for layer in layers]
+    tangled = [good[0], good[1] + np.array([0.0, 0.1, 0.0])]
+    monkeypatch.setattr("pipelines.refine.untangle", lambda meshes, *rest: Came([m.vertices.numpy() for m in meshes]))
+    asked = []
+
+    def led() -> list[np.ndarray]:
+        asked.append(1)
+        return good
+
+    for parts in (good, tangled):
+        found = drawn_apart(parts, faces, contact, QUICK, led)
+        assert all(np.allclose(m.vertices.numpy(), x, atol=1e-6) for m, x in zip(found, good, strict=True))
+    assert len(asked) == 1
+    assert len(drawn_apart(tangled, faces, contact, replace(QUICK, untangling=0), led)) == 2 and len(asked) == 1
+
+
+@dataclass
+class Came:
+    """Layers as they came."""
+
+    vertices: list[np.ndarray]
