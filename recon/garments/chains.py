@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from recon.garments.panels import Panel, cross
+from recon.garments.panels import Panel, cross, move_safely
 
 SHORTEST_RUN = 0.025
 """Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
@@ -17,6 +17,10 @@ SLIT_SHARES = (1.5, 0.8)
 label: between shorts and trousers, the hem of the shorts leaves such traces in the inseam."""
 CORNER_REACH = 0.03
 """How far from a label change its corner is searched [domain units]."""
+TURN_REACH = 0.015
+"""Along so much of the border on either side it is told how far it turns [domain units]."""
+AWAY = 2.0
+"""By so much less a corner counts as turning, per distance from the label change [radians / domain unit]."""
 MAX_CHAIN_DISTANCE = 0.15
 """Both chains of a seam lie this close in the plane [domain units], or they don't belong together."""
 
@@ -67,34 +71,57 @@ def without_slits(labels: NDArray, lengths: NDArray) -> NDArray:
         labels[index] = labels[first - 1]
 
 
-def corner_near(points: NDArray, lengths: NDArray, change: int) -> int:
-    """The loop vertex near a label change (first vertex of the new run) where the border turns most."""
-    n = len(points)
-    near = [change]
-    for step in (-1, 1):
-        k, walked = change, 0.0
-        while len(near) < n:
-            walked += lengths[k if step > 0 else (k - 1) % n]
-            if walked > CORNER_REACH:
-                break
-            k = (k + step) % n
-            near.append(k)
-    window = np.array(near)
-    reach = max(1, min(3, int(round(0.02 / max(float(lengths.mean()), 1e-9)))))
-    before = points[window] - points[(window - reach) % n]
-    after = points[(window + reach) % n] - points[window]
-    turn = np.abs(np.arctan2(cross(before, after), (before * after).sum(1)))
-    away = np.abs((window - change + n // 2) % n - n // 2)
-    best = int((turn - 0.01 * away).argmax())
-    return int(window[best]) if turn[best] > np.radians(25) else change
+def corner_near(points: NDArray, lengths: NDArray, change: int) -> tuple[int, NDArray]:
+    """The corner near a label change (first vertex of the new run): the loop vertex nearest to it, its place (2,).
+
+    Both sides of a seam must end in the same place, wherever a grid cuts their corners off: a corner is in the middle
+    of all that the border turns about where it turns most, and where the lines along its two sides meet.
+    """
+    order = (change - len(points) // 2 + np.arange(len(points))) % len(points)
+    at, place = np.concatenate([[0.0], np.cumsum(lengths[order[:-1]])]), points[order]
+    at -= at[len(points) // 2]
+    step = float(lengths.mean())
+    reach = max(TURN_REACH, 1.5 * step)
+
+    def on(t: NDArray) -> NDArray:
+        return np.stack([np.interp(t, at, x) for x in place.T], -1)
+
+    t = at[np.abs(at) <= max(CORNER_REACH, 3 * step)]
+    turn = _turn(on(t) - on(t - reach), on(t + reach) - on(t))
+    best = int((np.abs(turn) - AWAY * np.abs(t)).argmax())
+    if np.abs(turn[best]) <= np.radians(25):
+        return change, points[change]
+    about = np.nonzero(np.abs(at - t[best]) <= reach)[0][:, None] + np.array([-1, 0, 1])
+    a, b, c = place[np.clip(about, 0, len(at) - 1).T]
+    share = np.maximum(_turn(b - a, c - b) * np.sign(turn[best]), 0)
+    middle = float((share * at[about[:, 1]]).sum() / share.sum())
+    ends = on(middle + step * np.array([[-4.0, -1.5], [4.0, 1.5]]))
+    blunt, corner = on(np.array([middle]))[0], _meeting(ends[0], ends[1])
+    sharp = np.linalg.norm(corner - blunt) < reach
+    return int(order[np.abs(at - middle).argmin()]), corner if sharp else blunt
 
 
-def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
+def _meeting(one: NDArray, other: NDArray) -> NDArray:
+    """(2,) where the lines through two pairs of points (2, 2) meet; not finite where they are parallel."""
+    along = np.stack([one[1] - one[0], other[1] - other[0]])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = cross(other[1:] - one[1:], along[1:]) / cross(along[:1], along[1:])
+    return one[1] + far * along[0]
+
+
+def _turn(before: NDArray, after: NDArray) -> NDArray:
+    """(N,) angles from directions (N, 2) to others, counter-clockwise."""
+    return np.arctan2(cross(before, after), (before * after).sum(1))
+
+
+def chains_of(panel: Panel, labels: NDArray) -> tuple[Panel, list[Chain], NDArray]:
     """Seam chains of a panel and the border label of each of its points, from raw labels at its border vertices.
 
-    labels: (B,) in the order of ``panel.border``. Chains end at corners, which neighbouring chains share.
+    labels: (B,) in the order of ``panel.border``. Chains end at corners, which neighbouring chains share; the panel
+    comes back with those corners sharp.
     """
     chains, per_point, offset = [], np.full(len(panel.points), -1), 0
+    ends: dict[int, NDArray] = {}
     for loop in panel.loops:
         place = panel.points[loop]
         lengths = np.linalg.norm(np.roll(place, -1, 0) - place, axis=1)
@@ -102,9 +129,10 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
         offset += len(loop)
         per_point[loop] = 0
         changes = np.nonzero(clean != np.roll(clean, 1))[0]
-        corners = [corner_near(place, lengths, int(k)) for k in changes]
-        for k, start in enumerate(corners):
-            end = corners[(k + 1) % len(corners)]
+        found = [corner_near(place, lengths, int(k)) for k in changes]
+        ends |= {int(loop[k]): at for k, at in found}
+        for k, (start, _) in enumerate(found):
+            end = found[(k + 1) % len(found)][0]
             label = int(clean[changes[k]])
             if label == 0 or start == end:
                 continue
@@ -113,7 +141,9 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[list[Chain], NDArray]:
     chains = _without_scraps(panel, chains)
     for chain in chains:
         per_point[chain.points] = chain.label
-    return chains, per_point
+    sharp = np.array(list(ends.values())).reshape(-1, 2)
+    points = move_safely(panel.points, panel.faces, np.array(list(ends), np.int64), sharp)
+    return replace(panel, points=points), chains, per_point
 
 
 def _without_scraps(panel: Panel, chains: list[Chain]) -> list[Chain]:

@@ -188,13 +188,14 @@ def sew(panels: Sequence[Panel], labels: Sequence[NDArray], turned: Sequence[boo
         spacing: the grid's cell edge [domain units].
     """
     found = [chains_of(panel, own) for panel, own in zip(panels, labels, strict=True)]
+    panels = [panel for panel, _, _ in found]
     pairs = [
         (i, j, a, b)
         for i, j in combinations(range(len(panels)), 2)
-        for a, b in pair_chains(panels[i], panels[j], found[i][0], found[j][0])
+        for a, b in pair_chains(panels[i], panels[j], found[i][1], found[j][1])
     ]
     grown = []
-    for k, (panel, (chains, per_point)) in enumerate(zip(panels, found, strict=True)):
+    for k, (panel, chains, per_point) in enumerate(found):
         used = [a.points for i, _, a, _ in pairs if i == k] + [b.points for _, j, _, b in pairs if j == k]
         sewn_points = np.concatenate(used) if used else np.zeros(0, np.int64)
         for chain in chains:  # chains without a partner stay open

@@ -1,5 +1,7 @@
 """Cutting panels out of a grid, and sewing them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -196,13 +198,31 @@ def test_slivers_turn_their_long_edge_unless_it_is_a_border():
 
 def test_chains_pair_by_label_and_place():
     front = cut_panel(box(grid(64), 0.5, 0.6))
-    chains, labels = chains_of(front, side_labels(front))
+    _, chains, labels = chains_of(front, side_labels(front))
     assert sorted(c.label for c in chains) == [1, 2]
     pairs = pair_chains(front, front, chains, chains)
     assert all((a.points == b.points).all() for a, b in pairs)
     ends = front.points[[chains[0].points[0], chains[0].points[-1]]]
     np.testing.assert_allclose(np.abs(ends), [[0.5, 0.6]] * 2, atol=0.05)
     assert (labels[front.border] >= 0).all()
+
+
+@pytest.mark.parametrize("resolution", [64, 128, 256])
+@pytest.mark.parametrize("angle", [0.0, 0.35, 0.7])
+def test_seams_end_in_true_corners_wherever_the_grid_cuts_them(resolution, angle):
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    cell, half = 2 / resolution, np.array([0.4, 0.5])
+    for shift in np.random.default_rng(0).uniform(-cell, cell, (6, 2)):
+        panel = cut_panel(box((grid(resolution) - shift) @ turn, *half))
+        x = np.clip((panel.points[panel.border] - shift) @ turn, -half, half)
+        nearest = (np.arange(len(x)), (np.abs(x) - half).argmax(1))
+        x[nearest] = np.sign(x[nearest]) * half[nearest[1]]
+        panel = replace(panel, points=move_safely(panel.points, panel.faces, panel.border, x @ turn.T + shift))
+        labels = np.where(np.abs(x[:, 0]) > half[0] - 0.3 * cell, np.where(x[:, 0] < 0, 1, 2), 0)
+        sharp, chains, _ = chains_of(panel, labels)
+        ends = (sharp.points[np.concatenate([c.points[[0, -1]] for c in chains])] - shift) @ turn
+        assert np.abs(np.abs(ends) - half).max() < 0.45 * cell
+        assert len(chains) == 2 and (signed_areas(sharp.points, sharp.faces) > 0).all()
 
 
 def test_a_slit_within_a_seam_is_sewn_and_openings_between_seams_stay() -> None:
