@@ -21,6 +21,8 @@ TURN_REACH = 0.015
 """Along so much of the border on either side it is told how far it turns [domain units]."""
 AWAY = 2.0
 """By so much less a corner counts as turning, per distance from the label change [radians / domain unit]."""
+KEPT = 0.3
+"""So much of its area a triangle keeps where a corner is made sharp: slivers tear in every drape."""
 MAX_CHAIN_DISTANCE = 0.15
 """Both chains of a seam lie this close in the plane [domain units], or they don't belong together."""
 
@@ -142,7 +144,7 @@ def chains_of(panel: Panel, labels: NDArray) -> tuple[Panel, list[Chain], NDArra
     for chain in chains:
         per_point[chain.points] = chain.label
     sharp = np.array(list(ends.values())).reshape(-1, 2)
-    points = move_safely(panel.points, panel.faces, np.array(list(ends), np.int64), sharp)
+    points = move_safely(panel.points, panel.faces, np.array(list(ends), np.int64), sharp, KEPT)
     return replace(panel, points=points), chains, per_point
 
 

@@ -243,15 +243,18 @@ def cross(u: NDArray, v: NDArray) -> NDArray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray) -> NDArray:
-    """Points with ``index`` moved to ``target``, less far (down to not at all) where a triangle would flip."""
+def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray, least: float = 0.02) -> NDArray:
+    """Points with ``index`` moved to ``target``, less far (down to not at all) where a triangle would flip.
+
+    ``least``: so much of its area every triangle keeps.
+    """
     start = points[index]
     share = np.ones(len(index))
     row = np.full(len(points), -1)
     row[index] = np.arange(len(index))
     moving = row >= 0
     near = faces[corners(moving[faces]) > 0]
-    floor = 0.02 * np.abs(signed_areas(points, near))
+    floor = least * np.abs(signed_areas(points, near))
     moved = points.copy()
     for attempt in range(4):
         moved[index] = start + share[:, None] * (target - start)
