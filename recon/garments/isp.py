@@ -25,6 +25,9 @@ FAR = 1.0
 MAX_STEP = 0.5
 """Longest projection step, in cells."""
 
+KEPT = 0.3
+"""So much of its area a triangle keeps where borders are projected at last: slivers tear in every drape."""
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -88,6 +91,11 @@ class IspDecoder:
         plan = _Plan.make(sewn, latent, self.panels, resolution)
         steps = 2.0 / resolution * MAX_STEP
         points = self._on_border(field, plan, plan.points, steps, 1)
+        start, faces, border, goal = (
+            t.cpu().numpy() for t in (plan.points, plan.faces, plan.border, points[plan.border])
+        )
+        safe = move_safely(start, faces, border, goal, KEPT)
+        points = torch.as_tensor(safe, dtype=points.dtype, device=points.device)
         return self._remember(self._garment(latent, replace(plan, points=points), None), plan)
 
     def decode_like(self, latent: Tensor, garment: Garment) -> Garment:

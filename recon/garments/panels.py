@@ -254,11 +254,12 @@ def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray
     row[index] = np.arange(len(index))
     moving = row >= 0
     near = faces[corners(moving[faces]) > 0]
-    floor = least * np.abs(signed_areas(points, near))
+    areas = signed_areas(points, near)
+    side, floor = np.sign(areas), least * np.abs(areas)
     moved = points.copy()
     for attempt in range(4):
         moved[index] = start + share[:, None] * (target - start)
-        flipped = near[signed_areas(moved, near) < floor]
+        flipped = near[side * signed_areas(moved, near) < floor]
         rows = row[np.unique(flipped)]
         rows = rows[rows >= 0]
         if not len(rows):
