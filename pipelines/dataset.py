@@ -26,7 +26,7 @@ class DatasetMake:
     """Folder of the finished garments, one file each, and of the packed files."""
     seed: int = 0
     """The set depends on this number alone (on one machine)."""
-    tops: int = 400
+    tops: int = 600
     """Tank tops, T-shirts, shirts and jackets to train on."""
     skirts: int = 400
     """Skirts to train on."""
