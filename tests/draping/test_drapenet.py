@@ -16,6 +16,7 @@ from recon.draping.drapenet import (
     Known,
     group_of,
     load_drapenet,
+    rounds_for,
     under_top,
     widened,
 )
@@ -237,6 +238,11 @@ def test_bare_meshes_are_told_by_how_high_they_reach():
     draper = DrapeNetDraper(DrapeNets(DrapeShape(BODY.n_shape)), BODY)
     assert draper.group(replace(TOPS[0], kind="")) == "top"
     assert draper.group(replace(TROUSERS[0], kind="")) == "bottom"
+
+
+def test_very_fine_meshes_get_fewer_rounds() -> None:
+    flat = torch.zeros(0, 3, dtype=torch.long)
+    assert [rounds_for(Mesh(torch.zeros(n, 3), flat)) for n in (5_000, 50_000, 100_000, 10**6)] == [48, 48, 24, 12]
 
 
 def test_groups_and_files(nets, tmp_path):
