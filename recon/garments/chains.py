@@ -19,6 +19,8 @@ CORNER_REACH = 0.03
 """How far from a label change its corner is searched [domain units]."""
 TURN_REACH = 0.015
 """Along so much of the border on either side it is told how far it turns [domain units]."""
+FAR = 64
+"""Vertices on either side of a label change that are looked at."""
 AWAY = 2.0
 """By so much less a corner counts as turning, per distance from the label change [radians / domain unit]."""
 KEPT = 0.3
@@ -79,9 +81,10 @@ def corner_near(points: NDArray, lengths: NDArray, change: int) -> tuple[int, ND
     Both sides of a seam must end in the same place, wherever a grid cuts their corners off: a corner is in the middle
     of all that the border turns about where it turns most, and where the lines along its two sides meet.
     """
-    order = (change - len(points) // 2 + np.arange(len(points))) % len(points)
+    half = min(len(points) // 2, FAR)
+    order = np.arange(change - half, change + half) % len(points)
     at, place = np.concatenate([[0.0], np.cumsum(lengths[order[:-1]])]), points[order]
-    at -= at[len(points) // 2]
+    at -= at[half]
     step = float(lengths.mean())
     reach = max(TURN_REACH, 1.5 * step)
 

@@ -16,7 +16,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from recon.garments.chains import Chain, arc_lengths, chains_of, merge_parameters, pair_chains, resampled
-from recon.garments.panels import Panel, border_edges, border_loops, corners, move_safely, signed_areas
+from recon.garments.panels import Panel, border_edges, border_loops, corners, cross, move_safely, signed_areas
 
 SLIVER = 0.02
 """Height of a sliver over its longest side."""
@@ -115,16 +115,20 @@ def without_slivers(points: NDArray, faces: NDArray) -> NDArray:
     A triangle a few hundredths of a millimetre high is torn by the slightest change, and takes all of a drape's strain.
     """
     ends = points[faces]
-    sides = np.linalg.norm(ends[:, [1, 2, 0]] - ends, axis=2)
-    longest = sides.argmax(1)
-    thin = np.nonzero(2 * np.abs(signed_areas(points, faces)) < SLIVER * sides.max(1) ** 2)[0]
+    sides = ends[:, [1, 2, 0]] - ends
+    squares = np.einsum("fkx,fkx->fk", sides, sides)
+    thin = np.nonzero(np.abs(cross(sides[:, 0], sides[:, 1])) < SLIVER * squares.max(1))[0]
     if not len(thin):
         return faces
     faces = faces.copy()
-    owner = {(int(f[k]), int(f[(k + 1) % 3])): n for n, f in enumerate(faces) for k in range(3)}
+    touched = np.zeros(len(points), bool)
+    touched[faces[thin]] = True
+    near = np.nonzero(corners(touched[faces]) > 0)[0]  # all that can be turned or stand in the way
+    owner = {(f[k], f[(k + 1) % 3]): n for n, f in zip(near.tolist(), faces[near].tolist()) for k in range(3)}
     for n in thin.tolist():
-        a, c = int(faces[n, longest[n]]), int(faces[n, (longest[n] + 1) % 3])
-        b, other = int(faces[n, (longest[n] + 2) % 3]), owner.get((c, a))
+        longest = squares[n].argmax()
+        a, c = int(faces[n, longest]), int(faces[n, (longest + 1) % 3])
+        b, other = int(faces[n, (longest + 2) % 3]), owner.get((c, a))
         if other is None or owner.get((a, c)) != n:  # on the border, or turned already
             continue
         d = int(faces[other].sum()) - a - c
