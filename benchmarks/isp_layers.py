@@ -23,12 +23,13 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice, repeat
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from pipelines.drape_garments import between
+from pipelines.drape_garments import between, wearable
 from recon.bodies import Body, load_body
 from recon.bodies.clearance import clear_bodies
 from recon.bodies.pose_prior import sample_poses
@@ -88,11 +89,12 @@ def unseen_bodies(count: int, body: Body, seed: int, clear: bool = True) -> Body
 
 
 def unseen_garments(kind: str, count: int, resolution: int, seed: int) -> list[Garment]:
-    """Garments of codes between learned ones that no training drew."""
+    """Garments of codes between learned ones that no training drew, torn ones left out."""
     decoder = load_decoder(kind)
     generator = torch.Generator().manual_seed(UNSEEN + seed)
+    codes = (between(decoder.codes, generator) for _ in repeat(None))
     with torch.no_grad():
-        return [decoder.decode(between(decoder.codes, generator), resolution) for _ in range(count)]
+        return list(islice(filter(wearable, (decoder.decode(code, resolution) for code in codes)), count))
 
 
 WAYS = ("skinning", "displaced", "layered", "projected")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain, islice, repeat
 
 import torch
 from torch import Tensor
@@ -13,8 +14,11 @@ from recon.cloth.frames import FramePhysics, FrameWeights
 from recon.cloth.inextensible import OneRings
 from recon.draping.dress import held_vertices
 from recon.garments import GarmentDecoder, load_decoder
+from recon.metrics import largest_stretch
 from recon.types import Garment, Mesh
 
+TORN = 2.5
+"""Nowhere is a garment that can be worn so many times longer than it was cut."""
 NEIGHBOURS = 8
 """A code between two others is drawn between one and one of its so many nearest: clean garments, all of them new."""
 
@@ -28,13 +32,18 @@ def between(codes: Tensor, generator: torch.Generator) -> Tensor:
     return one + share * (other - one)
 
 
+def wearable(garment: Garment) -> bool:
+    """Whether it came whole: between codes of unlike garments a seam may be sewn to the wrong places."""
+    return float(largest_stretch(garment).max()) < TORN
+
+
 def garments_of(decoder: GarmentDecoder, count: int, vertices: int, generator: torch.Generator) -> list[Garment]:
     """``count`` garments of about so many vertices each: half random learned codes, half between learned ones."""
     chosen = torch.randperm(len(decoder.codes), generator=generator)[: (count + 1) // 2]
-    learned = [decoder.codes[k] for k in chosen]
-    codes = learned + [between(decoder.codes, generator) for _ in range(count - len(learned))]
+    codes = chain(decoder.codes[chosen], (between(decoder.codes, generator) for _ in repeat(None)))
     with torch.no_grad():
-        return [decoder.decode(code, resolution_for(decoder, code, vertices)) for code in codes]
+        decoded = (decoder.decode(code, resolution_for(decoder, code, vertices)) for code in codes)
+        return list(islice(filter(wearable, decoded), count))
 
 
 def resolution_for(decoder: GarmentDecoder, code: Tensor, vertices: int) -> int:

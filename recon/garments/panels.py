@@ -243,7 +243,7 @@ def cross(u: NDArray, v: NDArray) -> NDArray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray, least: float = 0.02) -> NDArray:
+def move_safely(points: NDArray, faces: NDArray, index: NDArray, target: NDArray, least: float = 0.2) -> NDArray:
     """Points with ``index`` moved to ``target``, less far (down to not at all) where a triangle would flip.
 
     ``least``: so much of its area every triangle keeps.

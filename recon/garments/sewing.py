@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from recon.garments.chains import Chain, arc_lengths, chains_of, merge_parameters, pair_chains, resampled
 from recon.garments.panels import Panel, border_edges, border_loops, corners, cross, move_safely, signed_areas
 
-SLIVER = 0.02
+SLIVER = 0.06
 """Height of a sliver over its longest side."""
 
 
