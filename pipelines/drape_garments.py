@@ -52,6 +52,12 @@ def resolution_for(decoder: GarmentDecoder, code: Tensor, vertices: int) -> int:
     return max(24, round(64 * (vertices / found) ** 0.5))
 
 
+def shoulders(garment: Garment) -> Tensor:
+    """(H,) vertices of the shoulder seams, which clothes hang on that no waistband holds."""
+    names = [k for k, name in enumerate(garment.seam_names) if name.startswith("shoulder")]
+    return garment.vertex_of_point[torch.isin(garment.border_labels, torch.tensor(names, dtype=torch.long))].unique()
+
+
 @dataclass(frozen=True)
 class Wardrobe:
     """Garments of one kind with their physics, all on the same posed bodies."""
@@ -61,6 +67,8 @@ class Wardrobe:
     physics: list[FramePhysics]
     held: list[Tensor]
     """Vertices of each waistband, empty where nothing holds it."""
+    hung: list[Tensor]
+    """Vertices of each one's shoulder seams, empty where it has none."""
 
     @classmethod
     def of(cls, garments: list[Garment], body: Body, weights: FrameWeights, frames: int) -> Wardrobe:
@@ -70,7 +78,8 @@ class Wardrobe:
         rings = [OneRings.of(g.mesh.vertices, g.mesh.faces) for g in garments]
         first = FramePhysics(cloths[0], rings[0], rest, weights, frames)
         physics = [first, *(first.dressed(c, r) for c, r in zip(cloths[1:], rings[1:], strict=True))]
-        return cls(garments, cloths, physics, [torch.as_tensor(held_vertices(g)) for g in garments])
+        held = [torch.as_tensor(held_vertices(g)) for g in garments]
+        return cls(garments, cloths, physics, held, [shoulders(g) for g in garments])
 
     @classmethod
     def decoded(

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from pipelines.drape_garments import Wardrobe
@@ -81,7 +82,9 @@ class TrainDrapeIsp:
     margin: float = 0.005
     """Distance from the body at which contact begins [m]."""
     pin: float = 50.0
-    """Stiffness that keeps a waistband where skinning has it [J/m² per vertex]."""
+    """Stiffness that keeps a waistband where skinning has it, and shoulder seams near there [J/m² per vertex]."""
+    slack: float = 0.08
+    """So far shoulder seams are free [m]: beyond lies the floor, where a dress has least energy of all."""
 
 
 def train_drape_isp(config: TrainDrapeIsp) -> Path:
@@ -159,6 +162,7 @@ class Loss:
             x = worn.placed(moved, body)
             energy, terms = self.wardrobe.physics[k](x)
             off = moved[:, self.wardrobe.held[k]].square().sum((1, 2))
+            off = off + F.relu(moved[:, self.wardrobe.hung[k]].norm(dim=2) - c.slack).square().sum(1)
             # Tight clothes on large bodies store many times the energy of others, and would be all that is learned.
             level = terms["strain"] + terms["collision"] + c.usual
             total = total + ((energy + c.pin * off) / level.to(energy)).mean() / c.worn
