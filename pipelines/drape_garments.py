@@ -53,7 +53,7 @@ def resolution_for(decoder: GarmentDecoder, code: Tensor, vertices: int) -> int:
 
 
 def shoulders(garment: Garment) -> Tensor:
-    """(H,) vertices of the shoulder seams, which clothes hang on that no waistband holds."""
+    """(H,) vertices of the seams on shoulders and arms, which clothes hang on that no waistband holds."""
     names = [k for k, name in enumerate(garment.seam_names) if name.startswith("shoulder")]
     return garment.vertex_of_point[torch.isin(garment.border_labels, torch.tensor(names, dtype=torch.long))].unique()
 

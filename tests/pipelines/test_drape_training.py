@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from pipelines.drape_garments import garments_of, shoulders, wearable
 from pipelines.drape_training import BodySampler, Sampling
 from recon.bodies import load_body
 from recon.bodies.clearance import Clearance, Clearing
 from recon.bodies.pose_prior import joint_limits
 from recon.bodies.poses import stroll
+from recon.garments import load_decoder
+from recon.garments.dataset import load_garments
 
 
 def draw(settings: Sampling, motions=(), count: int = 40):
@@ -59,3 +64,21 @@ def test_cleared_poses_are_fewer_and_hardly_pass_through_the_body() -> None:
     assert len(found.pose.unique(dim=0)) <= 6 < len(drawn.pose.unique(dim=0))
     assert clearance.deepest(drawn.pose).max() > 0.02
     assert clearance.deepest(found.pose).max() < 0.5 * clearance.deepest(drawn.pose).max()
+
+
+def test_clothes_hang_on_shoulder_seams_if_no_waistband_holds_them() -> None:
+    for kind in ("top", "dress", "skirt", "trousers"):
+        garment = load_garments(kind, "test")[0]
+        hung, y = shoulders(garment), garment.mesh.vertices[:, 1]
+        assert bool(len(hung)) == (kind in ("top", "dress"))
+        if len(hung):
+            assert len(hung) >= 4 and y[hung].min() > y.quantile(0.6)
+
+
+def test_torn_garments_are_not_learned_on() -> None:
+    decoder = load_decoder("skirt")
+    whole = garments_of(decoder, 3, 300, torch.Generator().manual_seed(0))
+    assert len(whole) == 3 and all(wearable(g) for g in whole)
+    x = whole[0].mesh.vertices.clone()
+    x[0] += 0.5
+    assert not wearable(replace(whole[0], mesh=whole[0].mesh.with_vertices(x)))
