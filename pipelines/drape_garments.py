@@ -33,8 +33,10 @@ def between(codes: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def wearable(garment: Garment) -> bool:
-    """Whether it came whole: between codes of unlike garments a seam may be sewn to the wrong places."""
-    return float(largest_stretch(garment).max()) < TORN
+    """Whether it came whole: coarse grids leave straps unsewn, and between codes of unlike garments a seam may be sewn
+    to the wrong places."""
+    sewn = all(bool((garment.border_labels == k).any()) for k in shoulder_seams(garment))
+    return sewn and float(largest_stretch(garment).max()) < TORN
 
 
 def garments_of(decoder: GarmentDecoder, count: int, vertices: int, generator: torch.Generator) -> list[Garment]:
@@ -54,8 +56,13 @@ def resolution_for(decoder: GarmentDecoder, code: Tensor, vertices: int) -> int:
 
 def shoulders(garment: Garment) -> Tensor:
     """(H,) vertices of the seams on shoulders and arms, which clothes hang on that no waistband holds."""
-    names = [k for k, name in enumerate(garment.seam_names) if name.startswith("shoulder")]
-    return garment.vertex_of_point[torch.isin(garment.border_labels, torch.tensor(names, dtype=torch.long))].unique()
+    labels = torch.tensor(shoulder_seams(garment), dtype=torch.long)
+    return garment.vertex_of_point[torch.isin(garment.border_labels, labels)].unique()
+
+
+def shoulder_seams(garment: Garment) -> list[int]:
+    """Their labels."""
+    return [k for k, name in enumerate(garment.seam_names) if name.startswith("shoulder")]
 
 
 @dataclass(frozen=True)
