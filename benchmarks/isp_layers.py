@@ -375,13 +375,13 @@ each, all in random poses:
 Ten minutes more made dresses no better and were not kept. Garments from the waist gained most, on 120 garments and with
 energies counted as they are up to .5 J, not .2 (12 garments, two bodies each): trousers .078 -> .059 in 20 minutes,
 skirts .176 -> .057 in 14. The same for tops, 17 minutes, was worse (.116 -> .288, .32 -> .64 % in the body) and for
-dresses as well: of the coarse garments that D_s learned on, a sixth of the tops and half of the dresses had straps that
-the grid left unsewn, and what is not held falls to the floor, where it has least energy. Tops that learned four garments
-a step at a third of the rate went from .125 to .120 and from .30 to .26 % in 24 minutes all the same. With whole garments
-only, held near their shoulders, dresses no longer fall, but 24 minutes (of twice as fine garments) left them no better
-over 72 drapes (.132 -> .163, .33 -> .39 %; median .117 -> .065 %) and were not kept. Of eight dresses' drapes on two
-bodies each the simulation keeps .03 of skinning's strain (D_s .19, D_m .15) and .17 % in the body: what is missing is the
-network's, in a few poses (legs that cross under a skirt). On a GPU nothing was tried."""
+dresses as well: of the coarse garments that D_s learned on, a sixth of the tops and half of the dresses had straps
+that the grid left unsewn, and what is not held falls to the floor, where it has least energy. Tops that learned four
+garments a step at a third of the rate went from .125 to .120 and from .30 to .26 % in 24 minutes all the same. With
+whole garments only, held near their shoulders, dresses no longer fall, but 24 minutes (of twice as fine garments) left
+them no better over 72 drapes (.132 -> .163, .33 -> .39 %; median .117 -> .065 %) and were not kept. Of eight dresses'
+drapes on two bodies each the simulation keeps .03 of skinning's strain (D_s .19, D_m .15) and .17 % in the body: what
+is missing is the network's, in a few poses (legs that cross under a skirt). On a GPU nothing was tried."""
 
 
 def _curves() -> list[str]:
