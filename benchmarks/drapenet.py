@@ -41,9 +41,9 @@ from recon.bodies import Body, load_body
 from recon.cloth.beneath import Beneath
 from recon.cloth.contact import BodyContact
 from recon.cloth.energies import Cloth, bending, gravity, stvk
-from recon.draping.drapenet import DrapeNetDraper, DrapeNets, Known, load_drapenet, rounds_for
+from recon.draping.drapenet import ROUNDS, DrapeNetDraper, DrapeNets, Known, load_drapenet
 from recon.draping.dress import dress
-from recon.draping.ending import Ending
+from recon.draping.ending import Ending, rounds_for
 from recon.draping.layering import settled
 from recon.draping.projected import ProjectedDraper
 from recon.draping.skinning import SkinningDraper
@@ -180,7 +180,7 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
         x = garment.mesh.vertices[pick] + 1e-3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
         mesh = Mesh(x, tube(count // 50, 50).faces)
         made = draper.nets.prepare(mesh, "top", code=code)
-        ending = Ending.of(Garment.bare("", mesh), draper.skinning.surface, rounds_for(mesh))
+        ending = Ending.of(Garment.bare("", mesh), draper.skinning.surface, rounds_for(mesh, ROUNDS))
         known = Known(None, code, ending=ending)
 
         def anew(mesh=mesh, known=known) -> torch.Tensor:
@@ -195,7 +195,7 @@ def times(size: Size, body: Body, draper: DrapeNetDraper) -> dict:
 
     def bound() -> Known:
         bound, code = draper.nets.bound(garment.mesh, draper.skinning), draper.nets.code(garment.mesh)
-        return Known(bound, code, ending=Ending.of(garment, draper.skinning.surface, rounds_for(garment.mesh)))
+        return Known(bound, code, ending=Ending.of(garment, draper.skinning.surface, rounds_for(garment.mesh, ROUNDS)))
 
     found["bind_ms"] = _timed(bound, size.repeats)
     return found

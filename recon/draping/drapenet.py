@@ -23,7 +23,7 @@ from recon.bodies.rig import JOINT_NAMES
 from recon.bodies.skin import shaped, skin
 from recon.cloth.beneath import Beneath
 from recon.draping.body_field import JOINTS, BodyFieldNet
-from recon.draping.ending import Ending
+from recon.draping.ending import Ending, rounds_for
 from recon.draping.isp import pose_features
 from recon.draping.layering import settled
 from recon.draping.mlp import layers_of, mlp, quickly, silent, waves, with_known
@@ -43,8 +43,6 @@ MANY = 20_000
 """Meshes of more vertices than this may be finer than the nodes."""
 ROUNDS = 48
 """Rounds that end a drape: with these strain is a tenth of skinning's, with half of them a seventh."""
-FEWEST, WORK = 12, 2_400_000
-"""Rounds of a mesh so fine that all of them, times its vertices, are more than ``WORK``: at 100,000 vertices 24."""
 FEW = 8
 """Up to so many bodies a garment is draped at once, and not made ready first."""
 
@@ -301,7 +299,7 @@ class DrapeNetDraper:
         asked = mesh.vertices.requires_grad and torch.is_grad_enabled()
         if last and not asked and last[0].vertices is mesh.vertices and last[0].faces is mesh.faces:
             return last[1]
-        ending = Ending.of(garment, self.skinning.surface, rounds_for(mesh))
+        ending = Ending.of(garment, self.skinning.surface, rounds_for(mesh, ROUNDS))
         found = Known(self.nets.bound(mesh, self.skinning), self.nets.code(mesh), ending=ending)
         if not asked:
             self._last = mesh, found
@@ -340,11 +338,6 @@ def load_drapenet(body, folder: str | Path | None = None) -> DrapeNetDraper:
     if body.n_shape != weights.card["shape"]["n_shape"] or body.name != weights.card["body"]:
         raise UserError(f"drapenet: learned for the body {weights.card['body']}; found {body.name}")
     return DrapeNetDraper(nets.to(body.weights.device), body)
-
-
-def rounds_for(mesh: Mesh) -> int:
-    """How many rounds end a mesh's drape."""
-    return max(FEWEST, min(ROUNDS, WORK // max(mesh.vertices.shape[-2], 1)))
 
 
 def under_top(bottom: Tensor, top: Tensor, gamma: float) -> Tensor:

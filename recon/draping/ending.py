@@ -19,6 +19,14 @@ from recon.types import Garment, Mesh, PosedBody
 ROUNDS = 24
 """Rounds that end a drape; on the coarse garments that networks learn on, half as many reach as far."""
 
+FEWEST, WORK = 12, 2_400_000
+"""Rounds of a mesh so fine that all of them, times its vertices, are more than ``WORK``: at 100,000 vertices 24."""
+
+
+def rounds_for(mesh: Mesh, most: int) -> int:
+    """How many rounds end a mesh's drape: up to ``most``, fewer where each takes long."""
+    return max(FEWEST, min(most, WORK // max(mesh.vertices.shape[-2], 1)))
+
 
 def edges_of(thing: Garment | Mesh, rounds: int) -> EdgeProjection:
     """Edge projection of a garment whose waistband stays; of a mesh without panels with the lengths that it has."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from recon.garments.panels import Panel, cross, move_safely
+from recon.garments.panels import KEPT, Panel, cross, move_safely
 
 SHORTEST_RUN = 0.025
 """Label runs shorter than this [domain units] are noise: real seams and openings are several times longer."""
@@ -23,8 +23,6 @@ FAR = 64
 """Vertices on either side of a label change that are looked at."""
 AWAY = 2.0
 """By so much less a corner counts as turning, per distance from the label change [radians / domain unit]."""
-KEPT = 0.3
-"""So much of its area a triangle keeps where a corner is made sharp: slivers tear in every drape."""
 MAX_CHAIN_DISTANCE = 0.15
 """Both chains of a seam lie this close in the plane [domain units], or they don't belong together."""
 
@@ -100,6 +98,7 @@ def corner_near(points: NDArray, lengths: NDArray, change: int) -> tuple[int, ND
     a, b, c = place[np.clip(about, 0, len(at) - 1).T]
     share = np.maximum(_turn(b - a, c - b) * np.sign(turn[best]), 0)
     middle = float((share * at[about[:, 1]]).sum() / share.sum())
+    # Lines from one and a half to four edges away: nearer the grid has cut the corner off.
     ends = on(middle + step * np.array([[-4.0, -1.5], [4.0, 1.5]]))
     blunt, corner = on(np.array([middle]))[0], _meeting(ends[0], ends[1])
     sharp = np.linalg.norm(corner - blunt) < reach

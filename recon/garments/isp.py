@@ -12,7 +12,7 @@ from torch import Tensor
 from recon.files.weights import read_weights
 from recon.garments.isp_lattice import Lattice, lattice
 from recon.garments.isp_net import IspNets, IspShape, Layer, halves_are_fast
-from recon.garments.panels import cut_panel, grid_axis, move_safely
+from recon.garments.panels import KEPT, cut_panel, grid_axis, move_safely
 from recon.garments.sewing import Sewn, sew
 from recon.types import Garment, Mesh, UserError, behind, to_device
 
@@ -24,9 +24,6 @@ FAR = 1.0
 """Signed distance written where a coarse cell rules the border out [domain units]."""
 MAX_STEP = 0.5
 """Longest projection step, in cells."""
-
-KEPT = 0.3
-"""So much of its area a triangle keeps where borders are projected at last: slivers tear in every drape."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,10 @@ from recon.types import Garment
 SNAP = 0.25
 """Grid vertices closer to the border than this share of a cell's edge move onto it."""
 
+KEPT = 0.3
+"""So much of its area a triangle keeps where corners are made sharp and borders projected at last: slivers tear in
+every drape."""
+
 TRIANGLE_NEIGHBOURS = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]], bool)
 """Grid neighbours that share a triangle edge when every cell is split along its (0,0)-(1,1) diagonal."""
 

@@ -16,10 +16,10 @@ from recon.draping.drapenet import (
     Known,
     group_of,
     load_drapenet,
-    rounds_for,
     under_top,
     widened,
 )
+from recon.draping.ending import rounds_for
 from recon.draping.mlp import waves
 from recon.draping.rest_code import RestCode
 from recon.files.weights import write_weights
@@ -242,7 +242,8 @@ def test_bare_meshes_are_told_by_how_high_they_reach():
 
 def test_very_fine_meshes_get_fewer_rounds() -> None:
     flat = torch.zeros(0, 3, dtype=torch.long)
-    assert [rounds_for(Mesh(torch.zeros(n, 3), flat)) for n in (5_000, 50_000, 100_000, 10**6)] == [48, 48, 24, 12]
+    meshes = (Mesh(torch.zeros(n, 3), flat) for n in (5_000, 50_000, 100_000, 10**6))
+    assert [rounds_for(mesh, 48) for mesh in meshes] == [48, 48, 24, 12]
 
 
 def test_groups_and_files(nets, tmp_path):
